@@ -24,7 +24,7 @@ from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
-from certbound.safety.misses import best_time, find_miss, window_of
+from certbound.safety.misses import arrival, best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
@@ -233,14 +233,18 @@ class _Search:
         if not turn:
             self._in_turn(names[1:])
 
+    def _again(self) -> None:
+        """In two states ask those that are done once more, though not thoroughly, if they look at more then."""
+        for name in (name for name in tuple(self.spent) if ENGINES[name].again and not self.safe):
+            if self.problem.system.dimension == 2 and self.answers[name].applicable and self._likely(name):
+                self.ask(name, replace(self.request, before=self.answers[name].details))
+
     def _first_bounds(self, names: tuple[str, ...]) -> None:
         """Ask those that have a first bound soon for it."""
-        for name in (name for name in names if name not in self.answers and self._soon(name)):
+        soon = (name for name in names if 0 < ENGINES[name].soon <= self.problem.system.dimension)
+        for name in (name for name in soon if name not in self.answers):
             with self.watch.share(_TURN):
                 self.ask(name, replace(self.request, first=True))
-
-    def _soon(self, name: str) -> bool:
-        return 0 < ENGINES[name].soon <= self.problem.system.dimension
 
     def _likely(self, name: str) -> bool:
         """Whether no sketch says that an engine has hardly a chance."""
@@ -258,6 +262,8 @@ class _Search:
         return self.chances[chance] >= 1
 
     def _turn_of(self, name: str) -> None:
+        if ENGINES[name].dear and ENGINES[name].spares <= self.problem.system.dimension:
+            self._again()  # cells of the start are not dear
         quick = self.spared(name)
         if quick and self.problem.system.dimension > _LARGE:
             return
@@ -269,8 +275,7 @@ class _Search:
             return
         most = _UNLIKELY if self.bounded and not self._likely(name) else math.inf
         with self.watch.share(_EXTRA if self.safe else 1.0, most):
-            details = None if before is None else before.details
-            self.ask(name, replace(self.request, quick=quick, bounded=self.bounded, before=details))
+            self.ask(name, replace(self.request, quick=quick, bounded=self.bounded, before=before and before.details))
 
     def ask(self, name: str, request: Request) -> None:
         """Keep the best that an engine finds; ``OutOfTime`` where the time ended it."""
@@ -335,8 +340,7 @@ class _Search:
     @cached_property
     def lasting(self) -> bool:
         """Whether the horizon is infinite, or of so many steps that none of them can be looked at."""
-        many = self.problem.system.time == "discrete" and self.problem.horizon > _LASTING
-        return many or self.problem.endless
+        return self.problem.endless or (self.problem.system.time == "discrete" and self.problem.horizon > _LASTING)
 
     @property
     def late(self) -> bool:
@@ -347,7 +351,7 @@ class _Search:
         """What an engine answers about meeting the target by a time; not to meet it by then says nothing from below."""
         found = row.prove(self.problem, request) if row.endless else None
         if found is None or not found.applicable:
-            found = row.prove(self.problem.replace(horizon=self.meeting[0]), request)
+            found = row.prove(self.problem.replace(horizon=arrival(self.problem)[0]), request)
             return replace(found, log10_lower=None, conclusive=False)
         return found
 

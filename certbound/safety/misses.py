@@ -14,6 +14,7 @@ from certbound.rigor.norms import Norm
 from certbound.safety.falsification import ATTEMPTS, Violation, candidates, follow, proved, rooms
 
 _DOUBLINGS, _SETTLED = 12, 3
+_NEARLY = 0.1  # of the depth that an earlier time, with less noise until then, is worth
 
 
 def window_of(problem: Problem) -> tuple[float, float]:
@@ -24,30 +25,42 @@ def window_of(problem: Problem) -> tuple[float, float]:
 def best_time(problem: Problem) -> float:
     """The time of the target's window at which the worst of a few noise-free trajectories is deepest in it.
 
-    In floating point: whatever it is, to meet the target then is one way of not failing.
+    In floating point: whatever it is, to meet the target then is one way of not failing. Without an end the time of
+    `arrival`, where there is one.
     """
     if problem.endless:
-        return _arrival(problem)
+        last, stay = arrival(problem)
+        return last if stay else _deepest(_until(problem, last), _NEARLY)
     first, last = window_of(problem)
     if first == last or (isinstance(problem.plan, np.ndarray) and problem.system.time == "continuous"):
         return last
+    return _deepest(problem, 0.0)
+
+
+def _deepest(problem: Problem, less: float) -> float:
+    """The first time at which the worst trajectory is deepest, or by such a part less deep."""
+    first, last = window_of(problem)
     times, _, _, paths, flow = _followed(problem)
     depth = rooms(Inside(problem.reach.region, (first, last)), flow, times, paths).min(axis=0)
     depth = np.where(np.isfinite(depth) & (times > 0), depth, -np.inf)
-    return float(times[np.argmax(depth)]) if np.any(depth > -np.inf) else last
+    most = depth.max()
+    return float(times[np.argmax(depth >= most - less * abs(most))]) if np.isfinite(most) else last
 
 
-def _arrival(problem: Problem) -> float:
-    """A time by which noise-free trajectories are well inside the target, where they ever are."""
+def arrival(problem: Problem) -> tuple[float, bool]:
+    """A time by which noise-free trajectories are well inside the target, and whether they ever stay there."""
     last, inside = 1.0, 0
     for _ in range(_DOUBLINGS):
         last *= 2
-        shorter = problem.replace(horizon=int(last) if problem.system.time == "discrete" else last)
-        times, _, _, paths, flow = _followed(shorter)
+        times, _, _, paths, flow = _followed(_until(problem, last))
         inside += bool(rooms(Inside(problem.reach.region), flow, times, paths)[:, -1].min() > 0)
         if inside == _SETTLED:
             break
-    return last
+    return last, inside == _SETTLED
+
+
+def _until(problem: Problem, last: float) -> Problem:
+    return problem.replace(horizon=int(last) if problem.system.time == "discrete" else last)
 
 
 def find_miss(problem: Problem) -> Violation | None:

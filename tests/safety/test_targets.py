@@ -192,6 +192,17 @@ def test_to_arrive_by_some_time_is_to_arrive_at_any():
     assert cb.verify_safety(problem.replace(reach=None), method="linear").status == "UNKNOWN"
 
 
+def test_a_target_on_an_orbit_is_met_at_the_first_pass():
+    """After 5 of 10 steps a turn, and after no power of two."""
+    c, s = np.cos(np.pi / 5), np.sin(np.pi / 5)
+    system = cb.DiscreteSystem(lambda x: [c * x[0] - s * x[1], s * x[0] + c * x[1]], states=2,
+                               noise=cb.Gaussian(std=0.01))  # fmt: skip
+    problem = cb.Problem(system, initial=[1, 0], safe=[cb.Inside(cb.Ball([0, 0], 2))], horizon=np.inf,
+                         reach=cb.Ball([-1, 0], 0.2))  # fmt: skip
+    verdict = cb.verify_safety(problem, method="linear")
+    assert (verdict.status, verdict.answers["linear"].hit) == ("SAFE", 5)
+
+
 def test_a_target_of_one_state_is_met_at_any_time():
     system = cb.ContinuousSystem(lambda x: -1.0 + 0 * x, states=1, diffusion=0.5)
     problem = cb.Problem(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import numpy as np
 
@@ -16,10 +17,14 @@ from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
 from certbound.reach.sets import ReachTube
+from certbound.watch import share_of_time
 
 _NOTHING = -0.1  # log of a probability that says nothing
 _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
 _MOST_PIECES = 4000  # pieces of time times cells
+_FEW = 3  # states up to which cells of the start are looked at without being asked thoroughly
+_AT_ONCE = 3  # states from which on that is at once: with fewer, polynomials and metrics are quick, and may say more
+_EARLY = 0.2  # of the time that is left, for them
 
 
 def refusal(problem: Problem) -> str | None:
@@ -30,8 +35,8 @@ def refusal(problem: Problem) -> str | None:
 
 
 def linear_answer(
-    problem: Problem | HeldLoop, *, cells: int | None = None, thorough: bool = True, before: LinearAnswer | None = None,
-    found: Callable[[LinearAnswer], object] = nobody,
+    problem: Problem | HeldLoop, *, cells: int | None = None, thorough: bool = True, quick: bool = False,
+    before: LinearAnswer | None = None, found: Callable[[LinearAnswer], object] = nobody,
 ) -> LinearAnswer:
     """Bound the probability of leaving the safe set by the linear response (Thm K7').
 
@@ -40,7 +45,10 @@ def linear_answer(
     cells : int, optional
         Cells along each side of the initial set; as few as serve when omitted.
     thorough : bool
-        False: one cell when omitted, and no larger shares where nothing was proved.
+        False: one cell when omitted, but for a while in three states, or in fewer with ``before``; and no larger shares
+        where nothing was proved.
+    quick : bool
+        One cell whatever the states.
     before : LinearAnswer, optional
         What was found for the same problem without ``thorough`` and ``cells``; it is not looked for again.
     found : callable
@@ -54,12 +62,17 @@ def linear_answer(
     best, effort = best_of(run, target, found) if before is None else (before.outcome, shares.HOPED[-1][1])
     unproved = best.log_probability > target.log
     plain = isinstance(problem, Problem) and not isinstance(run, DiffusionRun)
-    if thorough and cells is None and unproved and run.curved and plain:
+    alone = cells is None and unproved
+    if alone and run.curved and plain:
         assert isinstance(problem, Problem)
-        split = bisected(problem, run, target)
-        if split is not None:
-            return split
-    elif thorough and cells is None and unproved and best.bounds is None:
+        early = not quick and run.engine.n <= _FEW and (before is not None or run.engine.n >= _AT_ONCE)
+        if not run.parted and (thorough or early):
+            with nullcontext() if thorough else share_of_time(_EARLY):
+                split = bisected(problem, run, target)
+                if split is not None:
+                    return split
+                run.parted = True
+    elif thorough and alone and best.bounds is None:
         run, (best, effort) = _on_grids(problem, run, target, found) or (run, (best, effort))
     if thorough and best.log_probability > _NOTHING and run.curved:
         for likelier in (share for share in map(Share.of, shares.LIKELIER) if target.log < share.log):

@@ -56,7 +56,7 @@ class LinearRun(Inclusion):
     """One evaluation of the engine: the inclusion for the remainder, the events, and their room.
 
     ``hoped`` is the delta_N that promised most, here or in a run much like this one, and ``lost`` the logarithm of the
-    largest one at which the remainder could not be enclosed.
+    largest one at which the remainder could not be enclosed; ``parted``: cells of the starts were tried in vain.
     """
 
     def __init__(self, engine: Linearisation) -> None:
@@ -64,6 +64,7 @@ class LinearRun(Inclusion):
         super().__init__(engine, [[asked.rows for asked in cell] for cell in self.requirements])
         self.hoped: Share | None = None
         self.lost = -np.inf
+        self.parted = False
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[Share, tuple[Array, list[Events]]] = {}

@@ -35,7 +35,9 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             log10_delta=answer.log10_delta, method="linear", details=answer, foresight=foresight, reason=f"{reason}.",
         ))  # fmt: skip
 
-    answer = linear_answer(problem, cells=asked.cells, thorough=asked.thorough, before=asked.before, found=found)
+    answer = linear_answer(
+        problem, cells=asked.cells, thorough=asked.thorough, quick=asked.quick, before=asked.before, found=found
+    )
     tube = answer.tube
     return EngineAnswer(
         log10_delta=answer.log10_delta,

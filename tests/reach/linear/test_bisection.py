@@ -73,6 +73,21 @@ def test_the_side_that_makes_the_deviation_is_halved() -> None:
     assert {side for path in found.paths for side, _ in path} == {0}
 
 
+def test_in_few_states_cells_come_when_it_is_asked_again_but_not_in_haste(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, asked = flattening(), []
+
+    def in_vain(*_: object) -> None:
+        asked.append(1)
+
+    monkeypatch.setattr("certbound.reach.linear.answer.bisected", in_vain)
+    first = linear_answer(problem, thorough=False)
+    linear_answer(problem, thorough=False, quick=True, before=first)
+    assert not asked
+    for _ in range(2):  # and not a second time
+        linear_answer(problem, thorough=False, before=first)
+    assert len(asked) == 1
+
+
 def test_where_one_start_is_out_of_reach_nothing_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
     original = bisection.run_of
