@@ -66,8 +66,8 @@ def bound_region(
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     if not region.walls.groups:
         if any(itertools.chain(*plane.held)):
-            plane, written, rare = released(problem, plane, plain)
-            model, level = written or model, rough_level(plane)
+            plane, written, rare = released(problem, plane, plain, level)
+            model = written or model
         upper, done, _ = bound_plane_above(plane, model, level, patches, rare)
         return upper, None, f"value function in two states on a box that few paths leave, cells: {', '.join(done)}", []
     upper, done = 0.0, []

@@ -82,7 +82,7 @@ def two_states(
     plain, rare = model, -math.inf
     inner, model = held_plane(plane_of(problem, model, room.inner_low, room.inner_high, starts), model)
     if held_anywhere(inner):
-        inner, written, rare = released(problem, inner, plain)
+        inner, written, rare = released(problem, inner, plain, rough_level(inner))
         model = written or model
         near = _near(problem, inner)
         inner = near if rough_level(near) < rough_level(inner) + _ALIKE else inner
@@ -280,15 +280,17 @@ def held_plane(plane: Plane, model: Model) -> tuple[Plane, Model]:
     return plane, resolved(model, span, box)
 
 
-def released(problem: Problem, plane: Plane, model: Model) -> tuple[Plane, Model | None, float]:
+def released(
+    problem: Problem, plane: Plane, model: Model, level: float
+) -> tuple[Plane, Model | None, float]:
     """The plane without faces that hardly a path reaches, whose layers would cost much, and the log of their price.
 
     Let W be the plane's box. A path fails only if it leaves W: at such a face, which is what the price bounds, or at
     another one; V is wanted up to then. So where the drift leads inside nothing is asked of V at the face, and where it
-    leads out the box may go on, to 0 if no path crosses that. ``model`` is as it was asked; that given back is written for
-    the box, and None where the plane stays as it is.
+    leads out the box may go on, to 0 if no path crosses that. ``model`` is as it was asked; that given back is written
+    for the box, and None where the plane stays as it is. ``level`` is about log P.
     """
-    limits, level, span = limits_of(problem), rough_level(plane), (0.0, plane.horizon)
+    limits, span = limits_of(problem), (0.0, plane.horizon)
     box = [[plane.low[axis], plane.high[axis]] for axis in (0, 1)]
     price, free = -math.inf, []
     sides = [(axis, side) for axis, side in itertools.product((0, 1), (0, 1)) if not plane.held[axis][side]]
