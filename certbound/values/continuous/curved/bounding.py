@@ -67,7 +67,8 @@ def bound_region(
     if not region.walls.groups:
         if any(itertools.chain(*plane.held)):
             plane, written, rare = released(problem, plane, plain, level)
-            model = written or model
+            if written is not None:
+                model, level = written, rough_level(plane)
         upper, done, _ = bound_plane_above(plane, model, level, patches, rare)
         return upper, None, f"value function in two states on a box that few paths leave, cells: {', '.join(done)}", []
     upper, done = 0.0, []
