@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous import bound_exits, exits
 from certbound.values.continuous.coefficients import enclose
-from certbound.values.continuous.held_faces import held_face, resolved
+from certbound.values.continuous.held_faces import held_face, rarely_reached, resolved
+from certbound.values.continuous.payment import Payment, Terms
+from certbound.values.continuous.plane import held_plane, released, two_sides
+from certbound.values.continuous.plane.two_sides import plane_of, with_rare
 
 
 def line(f, g, safe, *, start=0.5, horizon=2.0, states=("x",)):
@@ -127,3 +131,54 @@ def test_the_square_of_a_root_is_what_is_under_it_and_stays_undefined_elsewhere(
     beyond = [Interval.point(np.zeros(1)), Interval(np.array([-0.1]), np.array([0.1]))]
     with pytest.raises(EnclosureError, match="undefined"):
         enclose(model.square.tape, beyond)
+
+
+def test_a_face_that_hardly_a_path_reaches_costs_no_less_than_the_reflection_principle() -> None:
+    """Brownian motion with drift -1 from .5: 1 is reached with Phi(..) + e^-1 Phi(..); and never less with a mild k."""
+    model = exits._model(line(lambda x: [-1.0], lambda t, x: [[0.2]], ([0.0], [1.0])))
+    found = rarely_reached(model, [(0.0, 1.0)], (0.5, 0.5), (0.0, 0.25), 0, 1)
+    root = 0.2 * math.sqrt(0.25)
+    ends = [math.erfc((0.5 + sign * 0.25) / (root * math.sqrt(2))) / 2 for sign in (1, -1)]
+    truth = math.log(ends[0] + math.exp(-2 * 0.5 / 0.04) * ends[1])
+    assert truth < found < 0.8 * truth
+    assert rarely_reached(model, [(0.0, 1.0)], (0.5, 0.5), (0.0, 1.0), 0, 0) == 0.0  # the drift leads there
+    assert rarely_reached(model, [(0.0, 1.0)], (0.5, 1.0), (0.0, 1.0), 0, 1) == 0.0  # starts lie on it
+
+
+def test_the_price_of_a_face_is_paid_and_a_bound_without_room_for_it_is_none() -> None:
+    terms = Terms(levels=None, lam=None, eps=None, steps=None, start=-3.0, end=-4.0)
+    paid = with_rare(Payment(log=math.log(1e-3), terms=terms), math.log(1e-4))
+    assert 1e-3 + 1e-4 / (1 - math.exp(-4.0)) <= math.exp(paid) < 1.2e-3
+    assert with_rare(Payment(log=-5.0, terms=replace(terms, end=-0.5)), -9.0) == 0.0
+
+
+def epidemic(limits) -> cb.Problem:
+    def g(t, x):
+        new, well = (np.sqrt(np.maximum(rate, 0) / 1000) for rate in (0.3 * x[0] * x[1], 0.25 * x[1]))
+        return [[-new, 0.0], [new, -well]]
+
+    def f(x):
+        return [-0.3 * x[0] * x[1], 0.3 * x[0] * x[1] - 0.25 * x[1]]
+
+    system = cb.ContinuousSystem(f, states=["S", "I"], diffusion=g)
+    return cb.Problem(system, initial=[0.95, 0.05], safe=[cb.Inside(cb.Box(*limits))], horizon=30)
+
+
+def test_limits_on_those_who_only_grow_fewer_are_left_out_and_paid_for(monkeypatch) -> None:
+    monkeypatch.setattr(two_sides, "rough_level", lambda plane: -6.5)
+    asked = epidemic(([0.3, 0.0], [1.0, 0.12]))
+    model = exits._model(asked)
+    whole = plane_of(asked, model, (0.3, 0.0), (1.0, 0.12), [(0.95, 0.95), (0.05, 0.05)])
+    plane = held_plane(whole, model)[0]
+    assert plane.held == ((False, False), (True, False))
+    found, _, price = released(asked, plane, model, -6.5)
+    assert found.held == ((False, True), (True, False))
+    assert found.low == (0.3, 0.0)  # .3 is where some drift to
+    assert -100 < price < -11.5
+
+
+@pytest.mark.slow
+def test_an_epidemic_is_bounded_near_what_simulations_say() -> None:
+    """Of 200 000 paths .00095 have .12 infected at some of 600 times."""
+    assert 9e-4 < 10 ** bound_exits(epidemic(([-np.inf, -np.inf], [np.inf, 0.12])), seconds=10).upper < 4e-3
+    assert 9e-4 < 10 ** bound_exits(epidemic(([0, 0], [1, 0.12])), seconds=10).upper < 4e-3

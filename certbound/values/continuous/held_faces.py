@@ -1,5 +1,7 @@
 """Faces that no path crosses, as the noise across them vanishes there: a price, a rate, a population stays above 0.
 
+Behind them faces that hardly a path reaches (`rarely_reached`), in the same models.
+
 **Lemma.** Let a_ii(t, x) <= K (c - x_i) and f_i(t, x, d) >= -K (c - x_i), a = g g', at all points with c - eta <= x_i
 <= c whose other states are in a box B. Then a path that starts in B with X_i >= c keeps X_i >= c until another state
 leaves B.
@@ -13,12 +15,19 @@ So nothing is asked of a value function at such a face, and the inequality of Th
 hypotheses hold where a_ii = 0 <= f_i on the face itself and the derivatives of both by x_i are bounded beside it. Where
 the model is not defined beyond the face (a square root of the state) no path is there.
 
+**Lemma.** Let k > 0, L >= 0 and k f_i(t, x, d) + k^2 a_ii(t, x) / 2 <= L on a box B, at all times up to T. Then a path
+that starts at x in B reaches X_i = c by T, before it leaves B in another way, with a probability of at most
+exp(L T - k (c - x_i)).
+
+*Proof.* exp(k X_i - L t), stopped where X leaves B, is a positive local supermartingale. QED.
+
 `resolved` writes the model for one side of the face: max(x, 0) is x where x >= 0, and sqrt(u)^2 is u where the root is
 defined, which the tape goes on to ask (`squared_diffusion`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -147,6 +156,50 @@ def _is_held(model: Model, box: Sequence[Ends], span: Ends, axis: int, side: int
     except EnclosureError:
         return False
     return True
+
+
+def rarely_reached(
+    model: Model, box: Sequence[Ends], inner: Ends, span: Ends, axis: int, side: int
+) -> float:
+    """An upper bound of log P(X_i reaches a side of the box before it leaves the box in another way).
+
+    Parameters
+    ----------
+    model, box, inner, span, axis, side
+        As for `held_face`.
+
+    Returns
+    -------
+    float
+        0 where the drift leads there. Proved by the second lemma of this module, in outward-rounded arithmetic.
+    """
+    gap = inner[0] - box[axis][0] if side == 0 else box[axis][1] - inner[1]
+    if not gap > 0:
+        return 0.0
+    times = 1 if model.autonomous else _PARTS
+    fine = [np.linspace(*ends, parts + 1) for ends, parts in zip((span, *box), (times, *[_PARTS] * len(box)))]
+    low = [cut.ravel() for cut in np.meshgrid(*(row[:-1] for row in fine), indexing="ij")]
+    high = [cut.ravel() for cut in np.meshgrid(*(row[1:] for row in fine), indexing="ij")]
+    cells = [Interval(a, b) for a, b in zip(low, high)]
+    drift, n = _output(model.drift.tape, axis), len(box)
+    try:
+        half = enclose(_output(model.square.tape, axis * n + axis), cells)[0][0] * Interval.point(0.5)
+        outward = [
+            enclose(drift, [*cells, *(one.broadcast_to(low[0].shape) for one in branch)])[0][0] * (2.0 * side - 1.0)
+            for branch in model.branches
+        ]
+    except EnclosureError:
+        return 0.0
+    least = 0.0
+    for k in np.geomspace(1.0, 1e4, 41) / gap:
+        steep = Interval.point(k)
+        rate = max(float(((one + half * steep) * steep).hi.max()) for one in outward)
+        length = Interval.point(span[1]) - Interval.point(span[0])
+        room = Interval.point(inner[0] if side == 0 else box[axis][1]) - Interval.point(
+            box[axis][0] if side == 0 else inner[1]
+        )
+        least = min(least, float((Interval.point(max(rate, 0.0)) * length - steep * room).hi))
+    return least if math.isfinite(least) else 0.0
 
 
 def _output(tape: Tape, output: int) -> Tape:

@@ -6,6 +6,7 @@ The way of `two_sides`, with what the region meets of each cell in place of all 
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from certbound.values.continuous.plane import (
     Source,
     bound_plane_above,
     held_plane,
+    released,
     rough_level,
     slab_times,
 )
@@ -59,10 +61,15 @@ def bound_region(
     problem: Problem, model: Model, deadline: float
 ) -> tuple[float, None, str, list[tuple[Surface, Payment]]]:
     """The upper bound on one grid after another; nothing is proposed for certificates, which know boxes only."""
+    plain, rare = model, -math.inf
     plane, region, level, model = _setting(problem, model)
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     if not region.walls.groups:
-        upper, done, _ = bound_plane_above(plane, model, level, patches)
+        if any(itertools.chain(*plane.held)):
+            plane, written, rare = released(problem, plane, plain, level)
+            if written is not None:
+                model, level = written, rough_level(plane)
+        upper, done, _ = bound_plane_above(plane, model, level, patches, rare)
         return upper, None, f"value function in two states on a box that few paths leave, cells: {', '.join(done)}", []
     upper, done = 0.0, []
     for share in _SHARES:

@@ -16,12 +16,13 @@ from certbound.values.continuous.plane.two_sides import (
     bound_plane_above,
     chart_plane,
     held_plane,
+    released,
     rough_level,
     two_states,
 )
 
 __all__ = [
     "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
-    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "reach_of", "rough_level", "slab_times",
-    "solve_lines", "spread_nodes", "two_states", "windowed",
+    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "reach_of", "released", "rough_level",
+    "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
 ]

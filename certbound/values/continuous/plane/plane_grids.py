@@ -46,7 +46,8 @@ class Plan:
     """How a proposal is made: cells along each axis, the slabs' growth, and what it starts from.
 
     At T there is a layer at each face, as steep as if it had evolved for the time ``lead``; V >= ``floor``. For lower
-    bounds (``below``) V is at most ``floor`` at T, and rises to 0 on the faces within ``lead``.
+    bounds (``below``) V is at most ``floor`` at T, and rises to 0 on the faces within ``lead``. The ``first`` share of
+    that is what slabs grow from.
     """
 
     cells: int
@@ -54,6 +55,7 @@ class Plan:
     lead: float
     floor: float = -math.inf
     below: bool = False
+    first: float = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -101,7 +103,7 @@ def slab_times(horizon: float, plan: Plan) -> Array:
     """Ends of the slabs in time to go, short at first."""
     times = [0.0]
     while times[-1] < horizon:
-        times.append(times[-1] + min(plan.growth * (0.1 * plan.lead + times[-1]), horizon * plan.growth / 4))
+        times.append(times[-1] + min(plan.growth * (plan.first * plan.lead + times[-1]), horizon * plan.growth / 4))
     return np.array(times) * (horizon / times[-1])
 
 

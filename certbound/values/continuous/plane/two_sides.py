@@ -22,7 +22,7 @@ from certbound.arrays import Array
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.charts import Chart
-from certbound.values.continuous.held_faces import check_noise, held_face, resolved
+from certbound.values.continuous.held_faces import check_noise, held_face, rarely_reached, resolved
 from certbound.values.continuous.hypotheses import (
     LIFTS,
     Model,
@@ -39,7 +39,7 @@ from certbound.values.continuous.plane.plane_below import bound_plane_below, pla
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.plane.plane_reach import reach_of
-from certbound.values.continuous.room import Room, points_of, starts_of
+from certbound.values.continuous.room import Room, limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -61,6 +61,10 @@ _SHARES = (0.12, 0.8)  # of the patches, for one grid after the other
 _LONGER = 4.0  # leads beside faces that no path crosses, where the noise across others may vanish in places
 _DEEP = 3.0  # how far below log P the floor is there
 _FLOORS = (-7.0, -20.0, -50.0)
+_FIRST = 0.02  # of the lead: slabs start shorter there
+_SLOPING = (-0.3,)  # and sources leave the cells at the faces alone, whose layers they would bend
+_RARE = 5.0  # how far below log P is what faces may be left out for
+_NEARER = (0.1, 0.2, 0.35, 0.6, 1.0)  # of the way to a face, where one is wanted that hardly a path reaches
 _BEYOND = 0.35  # how far beyond simulated paths a box ends, in units of their extent
 _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 BELOW = 0.6  # of as many patches again, for a lower bound
@@ -75,8 +79,11 @@ def two_states(
     What certificates state of both sides comes last.
     """
     starts = starts_of(problem)
+    plain, rare = model, -math.inf
     inner, model = held_plane(plane_of(problem, model, room.inner_low, room.inner_high, starts), model)
     if held_anywhere(inner):
+        inner, written, rare = released(problem, inner, plain, rough_level(inner))
+        model = written or model
         near = _near(problem, inner)
         inner = near if rough_level(near) < rough_level(inner) + _ALIKE else inner
     else:
@@ -85,7 +92,7 @@ def two_states(
             check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = rough_level(inner)
-    upper, done, proposed = bound_plane_above(inner, model, level, patches)
+    upper, done, proposed = bound_plane_above(inner, model, level, patches, rare)
     below: list[Proposed] = []
     if upper > wanted and not held_anywhere(inner):
         outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
@@ -99,9 +106,12 @@ def two_states(
 
 
 def bound_plane_above(
-    plane: Plane, model: Model, level: float, patches: float
+    plane: Plane, model: Model, level: float, patches: float, rare: float = -math.inf
 ) -> tuple[float, list[str], list[Proposed]]:
-    """An upper bound of log P(leaving the box) on one grid after another, what was done, and what was proved."""
+    """An upper bound of log P(leaving the box) on one grid after another, what was done, and what was proved.
+
+    ``rare`` is the log of the probability of a face that was left out (`released`), which no certificate states.
+    """
     upper, done = 0.0, []
     proposed: list[Proposed] = []
     plans = {plan.cells: plan for plan in (_plan(plane, level, share * patches) for share in _SHARES)}
@@ -111,9 +121,10 @@ def bound_plane_above(
             surface = _promising(plane, model, plan, kinds=kinds)
             if surface is not None:
                 payment = prove_upper(surface, model, plane.starts, plane.held)
-                if payment.log < upper:
-                    upper = payment.log
-                    proposed.append((raised_above(surface, plane.held), payment))
+                paid = with_rare(payment, rare)
+                if paid < upper:
+                    upper = paid
+                    proposed += [(raised_above(surface, plane.held), payment)] if rare == -math.inf else []
         except OutOfTime:
             if upper < 0:
                 break
@@ -131,7 +142,10 @@ def _plan(plane: Plane, level: float, patches: float) -> Plan:
     share = _LONGER if held else 0.32 * min(max(-level / 3, 1.0), 3.0)
     floor = level - _DEEP if held and level < 0 else -math.inf
     for cells in itertools.count(16):
-        plan = Plan(cells=cells, growth=min(6 / cells, 0.3), lead=share / cells * plane.horizon, floor=floor)
+        plan = Plan(
+            cells=cells, growth=min(6 / cells, 0.3), lead=share / cells * plane.horizon, floor=floor,
+            first=_FIRST if held else 0.1,
+        )  # fmt: skip
         if cells**2 * len(slab_times(plane.horizon, plan)) > patches:
             break
     return plan
@@ -183,7 +197,8 @@ def _promising(
     """
     best: Sketch | None = None
     for propose in list(kinds := _several() if kinds is None else kinds):
-        found = _refined(plane, model, plan, level, propose, _TOPS if propose is propose_plane else _TOPS[1:])
+        tops = _SLOPING if held_anywhere(plane) else _TOPS if propose is propose_plane else _TOPS[1:]
+        found = _refined(plane, model, plan, level, propose, tops)
         if found is None:  # the last one to be asked on the next grid
             kinds.append(kinds.pop(kinds.index(propose)))
             continue
@@ -263,6 +278,78 @@ def held_plane(plane: Plane, model: Model) -> tuple[Plane, Model]:
     (low, high), sides = zip(*box), [(row[0], row[1]) for row in held]
     plane = replace(plane, low=low, high=high, held=(sides[0], sides[1]))
     return plane, resolved(model, span, box)
+
+
+def released(
+    problem: Problem, plane: Plane, model: Model, level: float
+) -> tuple[Plane, Model | None, float]:
+    """The plane without faces that hardly a path reaches, whose layers would cost much, and the log of their price.
+
+    Let W be the plane's box. A path fails only if it leaves W: at such a face, which is what the price bounds, or at
+    another one; V is wanted up to then. So where the drift leads inside nothing is asked of V at the face, and where it
+    leads out the box may go on, to 0 if no path crosses that. ``model`` is as it was asked; that given back is written
+    for the box, and None where the plane stays as it is. ``level`` is about log P.
+    """
+    limits, span = limits_of(problem), (0.0, plane.horizon)
+    box = [[plane.low[axis], plane.high[axis]] for axis in (0, 1)]
+    price, free = -math.inf, []
+    sides = [(axis, side) for axis, side in itertools.product((0, 1), (0, 1)) if not plane.held[axis][side]]
+    cut = [one for one in sides if not math.isfinite((limits.inner_low, limits.inner_high)[one[1]][one[0]])]
+    for axis, side in (one for one in cut if _ends_at_0(model, box, plane, *one)):
+        box[axis][side] = 0.0
+        sides.remove((axis, side))
+    for axis, side in sides:
+        inside = _leads_inside(plane, axis, side)
+        begin, end = plane.starts[axis][side], box[axis][side]
+        for share in _NEARER if inside else (1.0,):  # the nearer the face, the finer the grid
+            ends = [(row[0], row[1]) for row in box]
+            place = begin + share * (end - begin) if share < 1 else end
+            ends[axis] = (place, ends[axis][1]) if side == 0 else (ends[axis][0], place)
+            log = rarely_reached(model, ends, plane.starts[axis], span, axis, side)
+            if log < level - _RARE:
+                break
+        if log < level - _RARE and (inside or _ends_at_0(model, box, plane, axis, side)):
+            box[axis][side] = place if inside else 0.0
+            free += [(axis, side)] if inside else []
+            price = float(np.logaddexp(price, log))
+    low, high = (box[0][0], box[1][0]), (box[0][1], box[1][1])
+    found, written = held_plane(replace(plane, low=low, high=high, held=((False, False), (False, False))), model)
+    held = [tuple(found.held[axis][side] or (axis, side) in free for side in (0, 1)) for axis in (0, 1)]
+    found = replace(found, held=((held[0][0], held[0][1]), (held[1][0], held[1][1])))
+    return (found, written, price) if rough_level(found) <= level + _ALIKE else (plane, None, -math.inf)
+
+
+def _ends_at_0(model: Model, box: list[list[float]], plane: Plane, axis: int, side: int) -> bool:
+    """Whether 0 is beyond a side, and no path crosses it from a box that goes on to there."""
+    wider = [(row[0], row[1]) for row in box]
+    end = wider[axis][side]
+    if not (end > 0 if side == 0 else end < 0):
+        return False
+    wider[axis] = (0.0, wider[axis][1]) if side == 0 else (wider[axis][0], 0.0)
+    return held_face(model, wider, plane.starts[axis], (0.0, plane.horizon), axis, side) == 0.0
+
+
+def _leads_inside(plane: Plane, axis: int, side: int) -> bool:
+    """Whether the drift nowhere leads out at a face, in floats."""
+    ends = [np.linspace(low, high, 33) for low, high in zip(plane.low, plane.high)]
+    ends[axis] = np.array([(plane.low, plane.high)[side][axis]])
+    x, y = np.meshgrid(*ends, indexing="ij")
+    drifts = [plane.drift(t, x, y)[:, axis] for t in np.linspace(0, plane.horizon, 5)]
+    return all(np.all(one * (1 - 2 * side) >= 0) for one in drifts)
+
+
+def with_rare(payment: Payment, rare: float) -> float:
+    """The payment's bound and the price of faces that were left out.
+
+    Paths that end there were not counted among those that pay w = exp(inf V(T, .)) in the end: P (1 - w) is at most
+    what the theorem says of all paths and w times the price more.
+    """
+    if rare == -math.inf or payment.terms is None:
+        return payment.log
+    end = payment.terms.end
+    if not end < -1:
+        return 0.0
+    return min(float(np.logaddexp(payment.log, rare + 0.5)) + 1e-12, 0.0)  # 1 / (1 - w) < e^0.5
 
 
 def _near(problem: Problem, plane: Plane) -> Plane:
