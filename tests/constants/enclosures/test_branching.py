@@ -95,6 +95,20 @@ def test_halves_cover_the_box_and_random_points_stay_inside():
     assert np.isfinite(points).all()
 
 
+def test_boxes_that_are_ruled_out_do_not_end_the_search():
+    def ruled(boxes, _):  # x + y on the circle of radius 1 alone, which hardly a point lies on
+        size = iv.sq(boxes).sum(axis=-1)
+        upper = boxes.hi.sum(axis=-1)
+        return np.where((size.lo <= 1) & (size.hi >= 1), upper, -np.inf), boxes.rad
+
+    def seen(points):
+        on = np.abs((points**2).sum(axis=-1) - 1) < 1e-12
+        return np.where(on, points.sum(axis=-1), np.nan)
+
+    found = bound_supremum(ruled, seen, Interval([-1.3, -1.2], [1.1, 1.4]), tolerance=1e-3, budget=20_000)
+    assert np.sqrt(2) <= found.upper < np.sqrt(2) + 0.02
+
+
 def test_a_tolerance_must_be_positive():
     with pytest.raises(ValueError, match="`tolerance` must be positive"):
         bound_supremum(bound, value, Interval([0.0, 0.0], [1.0, 1.0]), tolerance=0.0)
