@@ -129,8 +129,8 @@ def _state_dependent(model: Model, norm: Metric, tape: Tape, pieces: Interval | 
         start = values(ranges.mid[None], which)
         scale = float(start[0]) if np.isfinite(start[0]) else 1.0
         found = bound_supremum(  # mypy cannot type a lambda with a default
-            lambda boxes, _, which=which: (levels(boxes)[which], _widths(boxes, ranges, used)),  # type: ignore[misc]
-            lambda points, which=which: values(points, which),  # type: ignore[misc]
+            lambda boxes, _, which=which: (levels(boxes)[which], _widths(boxes, ranges, used)),  # type: ignore[misc]  # a default binds the loop's value
+            lambda points, which=which: values(points, which),  # type: ignore[misc]  # as above
             ranges,
             tolerance=1e-3 * (scale or 1e-300),
             budget=20_000,

@@ -261,6 +261,14 @@ def _(data: Data) -> None:
     data["claim"]["log10_delta"] = exact(-1.0)
 
 
+@forges(
+    "who leaves the domain has not failed where a path ends there", "surely steps", "claims.py", "check_side",
+    "path ends",
+)
+def _(data: Data) -> None:
+    data["problem"] |= {"domain": [exact([-0.5, 0.5])] * 4, "leaving": "ends"}
+
+
 @forges("the drift outweighs the noise", "drift", _LASTING, "check_drift", "outweigh the noise")
 def _(data: Data) -> None:
     data["problem"]["noise"]["values"] = exact([0.51])
