@@ -108,9 +108,22 @@ def _one_start(value: Any, dimension: int) -> Any:
             raise ValueError("`initial` must be a fixed set over all states, without `coordinates`.")
         if not np.all(np.isfinite([start.extent().lo, start.extent().hi])):
             raise ValueError("`initial` must be bounded, got a set with infinite sides.")
+        if type(start).extent is not Region.extent:
+            _check_extent(start)
     if start.dimension != dimension:
         raise ValueError(f"`initial` must have dimension {dimension} (the states), got {start.dimension}.")
     return start
+
+
+def _check_extent(start: Region) -> None:
+    """Refuse a shape's own box that does not hold what its form says: certificates state the box."""
+    around, eye = start.hull(), np.eye(start.dimension)
+    low, high = (sign * Region.local_support(start, sign * eye, 0.0) for sign in (-1, 1))
+    slack = 1e-6 * np.maximum(high - low, 1e-6 * np.abs(high + low))
+    if np.any((around.lo > low + slack) | (around.hi < high - slack)):
+        name = type(start).__name__
+        raise ValueError(f"`initial` reaches from {low} to {high} by its form, and its `extent` ends at {around.lo} and "
+                         f"{around.hi}; let `extent` of {name} hold the whole set, or leave it out.")  # fmt: skip
 
 
 def _checked_weight(name: str, value: Any, size: int, *, strict: bool) -> Array:

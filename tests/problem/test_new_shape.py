@@ -121,6 +121,12 @@ def test_a_start_that_leaves_the_set_somewhere_is_refused() -> None:
         course(Diamond(MOVING, 0.1))
 
 
+def test_a_start_whose_box_does_not_hold_it_is_refused() -> None:
+    short = type("Short", (Region,), dict(vars(Diamond), extent=lambda region: Interval([-0.01] * 2, [0.01] * 2)))
+    with pytest.raises(ValueError, match="its `extent` ends at .*let `extent` of Short hold the whole set"):
+        course(short([0.3, -0.2], 0.05))
+
+
 def test_polytopes_with_the_same_faces_have_the_same_bound() -> None:
     centred = [cb.Inside(Diamond([0.0, 0.0], 1.0)), cb.Outside(Diamond([0.75, 0.5], 0.25), during=(0, 2))]
     problem = course(safe=centred)

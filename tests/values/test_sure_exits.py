@@ -13,6 +13,7 @@ from certbound.safety.engines import values_engine
 from certbound.values.continuous import leaves_surely
 
 _BOX = cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))
+_STRIP = cb.Inside(cb.Box([-1.0], [1.0], coordinates=[0]))
 
 
 def _endless(drift, gain, safe=(_BOX,), *, states=2, **more) -> cb.Problem:
@@ -40,15 +41,23 @@ def test_the_drift_counts_from_the_side_that_helps() -> None:
     [
         _endless(lambda x: -x, lambda x: [[x[0], 0.0], [0.0, 0.0]]),
         _endless(lambda t, x: [-t * x[0], 0 * x[1]], [[0.5], [0.0]]),
-        _endless(lambda x: [x[1], -x[1]], [[0.0], [0.5]], [cb.Inside(cb.Box([-1.0], [1.0], coordinates=[0]))]),
+        _endless(lambda x: [x[1], -x[1]], [[0.0], [0.5]], [_STRIP]),
         _endless(lambda x: -x, 0.5 * np.eye(2), [cb.Inside(cb.HalfSpace([1.0, 0.0], 1.0))]),
         _endless(lambda x: -x, 0.5 * np.eye(2), reach=cb.Box([-0.8] * 2, [-0.6] * 2)),
         _endless(lambda x: -x, 0.5 * np.eye(2), [], domain=_BOX.region, leaving="ends"),
+        _endless(lambda x: [0 * x[0], 1 + x[1] ** 2], [[0.1], [0.0]], [_STRIP]),
+        _endless(lambda x: [0 * x[0], 1 + np.floor(x[1]) ** 2], [[0.1], [0.0]], [_STRIP]),
     ],
-    ids=["noise that vanishes", "a clock", "no noise", "one side", "a target", "ends"],
+    ids=["noise that vanishes", "a clock", "no noise", "one side", "a target", "ends", "runs off", "jumps off"],
 )
 def test_where_paths_may_stay_nothing_is_said(problem: cb.Problem) -> None:
     assert leaves_surely(problem) is None
+
+
+def test_a_state_without_limits_may_grow_as_fast_as_a_lipschitz_model_makes_it() -> None:
+    found = leaves_surely(_endless(lambda x: [0 * x[0], 1 + 3 * x[1]], lambda x: [[0.1], [0.2 * x[1]]], [_STRIP]))
+    assert found is not None
+    assert found.state == 0
 
 
 def test_a_step_of_normal_noise_leads_out_with_a_probability_that_has_a_bound() -> None:

@@ -50,6 +50,7 @@ _CLOSE = 0.1  # of log10: what is proved may be that far from what the program h
 _BUDGET = 20_000
 _TOLERANCE = 0.02  # of kappa T, of V at the start and of V at the boundary: a loss of 0.03 in log10
 _HIGHEST = 40.0
+_LOWEST = 600.0  # below it no tolerance is a positive float
 _LOG10 = math.log(10.0)
 
 
@@ -302,7 +303,7 @@ class _Work:
         exit_ = self._supremum(negative, self.hull, 0, self._leaving, _TOLERANCE)
         share = _TOLERANCE / horizon
         if steady:
-            share *= math.exp(min(start.upper, 0.0))
+            share *= math.exp(max(min(start.upper, 0.0), -_LOWEST))
             whole = trace(lambda v, g: np.exp(v[0]) * g[0], {"v": ["v"], "g": ["g"]})
             generator = substitute(whole, generator.inputs, {"v": value, "g": generator})
         growth = self._supremum(generator, self.ranges, 1, self._safe, share)

@@ -12,6 +12,7 @@ import numpy as np
 from certbound.arrays import Array, Mask
 from certbound.parallel import alone
 from certbound.problem.problem import Problem
+from certbound.problem.sets import Inside
 from certbound.simulation.blocks import MEMORY_LIMIT
 from certbound.simulation.estimates import bound_binomial, sample_paths, simulate_exits
 from certbound.synthesis.costs import Cost, cost_of
@@ -34,7 +35,7 @@ class ClosedLoop:
     times: Array  # (N + 1,)
     mean_cost: Array  # (N + 1,): mean stage cost at each time; at the last one of the state alone
     mean_final_cost: float  # its last entry
-    by_constraint: dict[str, int]  # label to the number of runs that broke it (in continuous time: first)
+    by_constraint: dict[str, int]  # label to the number of runs that broke it (DT: and none that is stated before it)
     seconds: float
 
 
@@ -122,14 +123,19 @@ def _costs(cost: Cost, times: Array, paths: Array, inputs: Array) -> Array:
 
 
 def _broken(problem: Problem, paths: Array, counts: dict[str, int]) -> Mask:
-    """Which runs break a constraint at some step; counted by constraint."""
+    """Which runs break a constraint at some step, before they end in leaving the domain; counted by constraint."""
+    times = range(paths.shape[1])
+
+    def kept(constraint: Inside) -> Mask:
+        return np.stack([constraint.satisfied(paths[:, k], float(k)) for k in times], axis=1)
+
+    asked, alive = problem.constraints, np.ones(paths.shape[:2], dtype=bool)
+    if problem.ending:
+        asked, alive = asked[:-1], np.logical_and.accumulate(kept(asked[-1]), axis=1)
     broken = np.zeros(len(paths), dtype=bool)
-    for constraint in problem.constraints:
+    for constraint in asked:
         first, last = (0, paths.shape[1] - 1) if constraint.during is None else (int(t) for t in constraint.during)
-        if constraint.region.moving:
-            kept = np.all([constraint.satisfied(paths[:, k], float(k)) for k in range(first, last + 1)], axis=0)
-        else:
-            kept = np.all(constraint.satisfied(paths[:, first : last + 1]), axis=1)
-        counts[constraint.label] += int((~kept).sum())
-        broken |= ~kept
+        found = (alive & ~kept(constraint))[:, first : last + 1].any(axis=1)
+        counts[constraint.label] += int((found & ~broken).sum())
+        broken |= found
     return broken

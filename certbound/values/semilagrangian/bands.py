@@ -198,13 +198,12 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
     part = Lines(nodal=value.nodal[lines], bend=value.bend[lines])
     near = slopes[0][inner], slopes[1][inner]
     least = smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[0])
-    least = replace(least, lift=least.lift + band.apart * least.fourth)
-    found = [_landed(band, frame, mesh, least)]
+    tables = [least]
     if band.apart > 0:
-        most = smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[1], least)
-        found.append(_landed(band, frame, mesh, most))
-    else:
-        found.append(found[0])
+        tables.append(smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[1], least))
+    between = band.apart * least.fourth  # whatever share of either a cell takes
+    found = [_landed(band, frame, mesh, replace(table, lift=table.lift + between)) for table in tables]
+    found += found[: 2 - len(found)]
     share, live = band.share, band.live
     nodal = np.full((live.shape[0] + 1, live.shape[1] + 1), NOWHERE)
     bend = np.full((live.shape[0] + 1, live.shape[1]), -np.inf)

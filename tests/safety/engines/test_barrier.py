@@ -241,3 +241,10 @@ def test_a_further_degree_that_cannot_reach_the_target_is_given_up_at_once(monke
     assert barrier_engine(problem).log10_delta < -1
     assert [degree for degree, _ in hopes].count(6) == 1
     assert hopes[-1][1] > -3
+
+
+def test_a_proposal_that_is_far_below_at_the_start_leaves_no_tolerance_of_0() -> None:
+    system = cb.ContinuousSystem(lambda x: [3 * np.sign(x[0])], states=["x"], diffusion=[[0.15]])
+    safe = [cb.Inside(cb.Box([-1.6], [1.6]))]
+    found = barrier_engine(scalar(initial=[0.3], safe=safe, horizon=10.0, delta=1e-3).replace(system=system))
+    assert found.reason == "no polynomial barrier was found."

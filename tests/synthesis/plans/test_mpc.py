@@ -269,3 +269,15 @@ def test_a_plan_needs_an_end() -> None:
         problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=np.inf)
         with pytest.raises(InfeasibleError, match="give a finite `horizon`"):
             cb.synthesize_plan(problem)
+
+
+def test_a_run_that_ends_where_it_leaves_the_domain_breaks_nothing_later():
+    system = cb.DiscreteSystem(
+        lambda x, u: [0.9 * x[0] + u[0]], states=["x"], inputs=cb.Box([-1], [1]), noise=cb.Gaussian(std=0.2)
+    )
+    problem = cb.Problem(
+        system, initial=[0.5], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3, delta=0.9, cost=(np.eye(1), np.eye(1)),
+        domain=cb.Box([-0.6], [0.6]), leaving="ends",
+    )  # fmt: skip
+    runs = cb.simulate_closed_loop(cb.synthesize_plan(problem), runs=2000, rng=0)
+    assert runs.violations <= 5  # one in nine leaves the domain

@@ -269,6 +269,23 @@ def test_every_cell_of_a_band_has_the_variance_of_its_own_step(rng) -> None:
     assert np.exp(k**2 / 2 * apart) > 1.04  # one variance for all would not do
 
 
+def test_every_cell_pays_for_what_lies_between_two_variances(rng) -> None:
+    problem = mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 0.5, [0, -1.5], [1.6, 1.5], 2.0, (1.0, 0.0))
+    _, layout = frame_and_bands(problem, count=14, wide=0.06, fine=4.0)
+    frame, band = layout.frame, max(layout.bands, key=lambda one: one.apart)
+    nodal = np.broadcast_to(rng.uniform(0, 1, frame.q.size), (frame.y.size, frame.q.size))
+    value, flat = Lines(nodal=nodal, bend=0 * nodal[:, 1:]), 0 * nodal[1:, 1:]
+
+    def paid(share: float) -> np.ndarray:
+        looks = (replace(band, share=0 * band.share + share, apart=apart) for apart in (band.apart, 1e-30))
+        first, second = (through(one, frame, value, (flat, flat))[2][band.live] for one in looks)
+        return first - second
+
+    least = paid(0.0)
+    assert least.max() > 0
+    assert np.all(paid(0.75) >= 0.75 * least * (1 - 1e-6))  # T_v, a function f of v, is off by (v - a)(b - v)/2 |f''|
+
+
 @pytest.mark.parametrize("force", [lambda x: -x[0] - 0.5 * x[1], lambda x: x[0] - x[0] ** 3 - 0.5 * x[1]])
 def test_a_step_back_lies_above_the_mean_of_any_function_on_the_grid(force, rng) -> None:
     problem = mechanical(force, 0.5, [0, -1.5], [1.6, 1.5], 1.0, (1.0, 0.0))

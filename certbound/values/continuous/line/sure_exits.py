@@ -16,12 +16,15 @@ the mean.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 
-from certbound.problem.model import Tape, sources
+from certbound.arrays import Array
+from certbound.errors import EnclosureError
+from certbound.problem.model import JUMPS, Tape, jacobian, sources
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.rigor.intervals import Interval
@@ -48,8 +51,9 @@ class SureExit:
 def leaves_surely(problem: Problem) -> SureExit | None:
     """Why every path leaves the safe set in the end; None where that is not proved.
 
-    No target, limits that always hold and stand still, and a model without t. An EnclosureError where the model is
-    undefined somewhere in the box around the safe set.
+    No target, limits that always hold and stand still, a model without t, and in continuous time no path that may run
+    off to infinity before it leaves. An EnclosureError where the model is undefined somewhere in the box around the safe
+    set.
     """
     system = problem.system
     square = _square(system)
@@ -63,6 +67,8 @@ def leaves_surely(problem: Problem) -> SureExit | None:
     around, n = _hull(problem), system.dimension
     box = system.disturbance
     pushes = [] if box is None else [Interval(a, b) for a, b in zip(box.low, box.high)]
+    if isinstance(system, ContinuousSystem) and not _lasts(problem.closed_loop, system.diffusion, around, pushes):
+        return None
     found: list[SureExit] = []
     for state in np.flatnonzero(np.isfinite(around.lo) & np.isfinite(around.hi)).tolist():
         edges = np.linspace(around.lo[state], around.hi[state], _PARTS + 1)
@@ -98,6 +104,22 @@ def _square(system: ContinuousSystem | DiscreteSystem) -> Tape | list[float] | N
     law = system.noise.exact_covariance()
     variances = [sum(a * b * law[i][j] for i, a in enumerate(row) for j, b in enumerate(row)) for row in rows]
     return [float(np.nextafter(float(value), -np.inf)) for value in variances]
+
+
+def _lasts(drift: Tape, diffusion: Array | Tape, around: Interval, pushes: Sequence[Interval]) -> bool:
+    """Whether no path reaches infinity in finite time: the box is bounded, or the model Lipschitz on it."""
+    n = len(around.lo)
+    if np.isfinite([around.lo, around.hi]).all():
+        return True
+    for tape in (drift, *([diffusion] if isinstance(diffusion, Tape) else [])):
+        inputs = [Interval.point(0.0), *(around[k] for k in range(n)), *pushes][: len(tape.inputs)]
+        try:
+            slopes = enclose(jacobian(tape, list(range(1, 1 + n))), inputs)[0]
+        except EnclosureError:
+            return False
+        if any(node.op in JUMPS for node in tape.nodes) or not all(np.isfinite(slope.mag).all() for slope in slopes):
+            return False
+    return True
 
 
 def _hull(problem: Problem) -> Interval:
