@@ -118,7 +118,7 @@ ENTERED = {
 MOST_DOORS = 5
 MANY_DOORS = {
     "checker.endless": (7, "a proof from above and one from below of each kind, which the table of engines names"),
-    "values.continuous": (15, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
+    "values.continuous": (16, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (36, "the one description of functions, which every room reads, differentiates and evaluates"),

@@ -40,7 +40,7 @@ _MOST_STATES = 12
 _LOOSE, _LARGE = 0.1, 0.5  # remainders, in working boxes within the horizon: small; large enough to be made small
 _SINGLE = 0.6  # of the time of a group's program that one wall's takes
 _FIRST_SLABS, _FEWER_SLABS, _SMALL_DIMENSION = 8, 4, 4  # at first, up to so many states and beyond
-_MOST_BLOCKS = 12_000
+_MOST_ENTRIES = 1.1e6  # of the matrix inequalities of a program
 _MARGINS = (4.0, 7.0, 2.5)
 _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repeated
 _DONE = 1e-3  # share of the bound that a wall may have without being looked at again
@@ -295,6 +295,7 @@ class Search:
         if not attempt.level < 0:  # windows are no cure, and pieces seldom
             hopes = {PIECES: _HOPE / 3} | self._slabs(attempt)
         left, found = until - time.perf_counter(), []
+        entries = math.comb(self.setting.dimension + 2, 2)
         if attempt.others and attempt.gains.get(APART, math.inf) > 0:
             many = _SINGLE * len(attempt.finer(APART)) * attempt.seconds
             hopes = {APART if many < left or not attempt.paired else PAIRS: 1.0}
@@ -302,7 +303,7 @@ class Search:
             blocks = sum(child.blocks for child in attempt.finer(kind))
             seconds = (_SINGLE if kind in (APART, PAIRS) else 1.3) * blocks / attempt.blocks * attempt.seconds
             gain = _AGAIN * attempt.gains[kind] if kind in attempt.gains else self.gains.get(kind, hope)
-            if gain > _GAIN and blocks <= _MOST_BLOCKS and seconds < left:
+            if gain > _GAIN and blocks * entries <= _MOST_ENTRIES and seconds < left:
                 found.append(Option(int(place), kind, gain, max(seconds, 1e-3)))
         return max(found, key=lambda option: option.gain / option.seconds, default=NOTHING)
 

@@ -36,6 +36,7 @@ _LARGE = 60  # states beyond which no other engine is asked once one has proved 
 _PATIENCE = 0.4  # of the time that is left, after which the other engines have a turn
 _TURN = 0.5  # of the time that is left then, for all of them
 _LAST = 0.2  # of the time that is left then, where none of them has much of a chance
+_FIRST = 0.1  # of the time that is left, for first bounds where the engine in turn has a good chance
 _SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
 _UNLIKELY = 2.0  # seconds for an engine that has hardly a chance, once there is a bound
 _THOROUGH, _LONGER = 120.0, 1.0  # seconds for an engine asked once more without a limit, or times those so far
@@ -106,8 +107,7 @@ class _Search:
     @property
     def refuted(self) -> bool:
         """Whether UNSAFE is proved."""
-        below = best_lower(self.answers)
-        return below is not None and is_more_than(below, self.problem.delta)
+        return (below := best_lower(self.answers)) is not None and is_more_than(below, self.problem.delta)
 
     @property
     def bounded(self) -> bool:
@@ -210,11 +210,12 @@ class _Search:
             return
         turn: list[bool] = []
         patience = _PATIENCE * self.watch.left
+        surely = 1 <= self._chance(names[0]) < math.inf
         share = _TURN if any(map(self._likely, names[1:])) or not self._likely(names[0]) else _LAST
 
         def others() -> None:
             turn.append(True)
-            with self.watch.share(share):
+            with self.watch.share(_LAST if surely else share):
                 self._in_turn(names[1:])
             self._in_full(names[1:], share)
             if self.safe:
@@ -222,7 +223,7 @@ class _Search:
 
         def first_bounds() -> None:
             if not self.safe:
-                self._first_bounds(names[1:])
+                self._first_bounds(names[1:], _FIRST if surely else _TURN)
                 if self.safe:
                     raise OutOfTime
             self.watch.remind(max(patience - _SOON, 0.0), others)
@@ -239,27 +240,26 @@ class _Search:
             if self.problem.system.dimension == 2 and self.answers[name].applicable and self._likely(name):
                 self.ask(name, replace(self.request, before=self.answers[name].details))
 
-    def _first_bounds(self, names: tuple[str, ...]) -> None:
+    def _first_bounds(self, names: tuple[str, ...], share: float) -> None:
         """Ask those that have a first bound soon for it."""
-        soon = (name for name in names if 0 < ENGINES[name].soon <= self.problem.system.dimension)
-        for name in (name for name in soon if name not in self.answers):
-            with self.watch.share(_TURN):
-                self.ask(name, replace(self.request, first=True))
+        for name in (name for name in names if 0 < ENGINES[name].soon <= self.problem.system.dimension):
+            if name not in self.answers:
+                with self.watch.share(share):
+                    self.ask(name, replace(self.request, first=True))
 
     def _likely(self, name: str) -> bool:
         """Whether no sketch says that an engine has hardly a chance."""
-        chance, sketched = ENGINES[name].chance, self.sketches.get(name)
-        if chance is None or self.request.constants is not None:
-            return True
-        if sketched is not None and sketched.applicable and sketched.log10_delta < 0:
-            return True
-        if chance not in self.chances:
-            try:
-                with contained(name):
-                    self.chances[chance] = chance(self.problem)
-            except EngineError:
-                self.chances[chance] = math.inf
-        return self.chances[chance] >= 1
+        sketched = self.sketches.get(name)
+        return (sketched is not None and sketched.applicable and sketched.log10_delta < 0) or self._chance(name) >= 1
+
+    def _chance(self, name: str) -> float:
+        """What a sketch says of an engine's chance; infinite where none says anything."""
+        chance = ENGINES[name].chance
+        if chance is not None and self.request.constants is None and chance not in self.chances:
+            self.chances[chance] = math.inf
+            with contextlib.suppress(EngineError), contained(name):
+                self.chances[chance] = chance(self.problem)
+        return self.chances.get(chance, math.inf)
 
     def _turn_of(self, name: str) -> None:
         if ENGINES[name].dear and ENGINES[name].spares <= self.problem.system.dimension:

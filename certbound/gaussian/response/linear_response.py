@@ -23,6 +23,7 @@ _UNIT = 2.0**-53
 _TINY = 1e-300
 _TERMS = 24
 _MEMORY = 6 * 2**30  # bytes that the rows of one cell may take
+_KEPT = 2**29  # bytes of absolute values that are kept beside the coefficients
 _MILD = 2.0  # norm of the slopes times a piece, up to which series run well in the states' own units
 _SWEEPS, _FARTHEST = 20, 60  # of balancing; exponent of a unit
 _LARGE, _SPARSE = 40, 0.1  # states and share of nonzero entries from which on products are sparse
@@ -310,21 +311,26 @@ class RowResponse:
                 self.rest[j] = np.abs(later[:, self.others]).sum(axis=1) * (1 + 1e-12)
             current[j + 1 :] = _times(later, self.transition[j]).reshape(-1, self.count, n)
         self.initial = current
+        few = sum(part.nbytes for part in self.coefficients) <= _KEPT
+        self.magnitudes = [np.abs(part) for part in self.coefficients] if few else None
 
     def _gather(self, parts: Iterator[Array]) -> Array:
-        """Sum over j of the contributions of step j to all later nodes: shape (M, D)."""
-        total = np.zeros((self.nodes, self.count))
+        """Sum over j of the contributions of step j to all later nodes: shape (M, D), or (M, D, ...) as they are."""
+        total: Array | None = None
         for j, part in enumerate(parts):
             poll()
-            total[j + 1 :] += part.reshape(-1, self.count)
-        return total[:, self.place]
+            more = part.reshape(-1, self.count, *part.shape[1:])
+            total = np.zeros((self.nodes, *more.shape[1:])) if total is None else total
+            total[j + 1 :] += more
+        return np.zeros((self.nodes, len(self.place))) if total is None else total[:, self.place]
 
     def _sizes(self, bounds: Array) -> Array:
-        """Sum over j of |coefficients| ``bounds``_j: shape (M, D), not rounded."""
-        few = bool(len(self.others))
+        """Sum over j of |coefficients| ``bounds``_j, (N, n) or (N, n, B): shape (M, D) or (M, D, B), not rounded."""
+        few, own = bool(len(self.others)), bounds[:, self.columns]
+        sizes = map(np.abs, self.coefficients) if self.magnitudes is None else self.magnitudes
         return self._gather(
-            np.abs(c) @ bounds[j, self.columns] + (self.rest[j] * bounds[j, self.others].max() if few else 0.0)
-            for j, c in enumerate(self.coefficients)
+            size @ own[j] + (np.multiply.outer(self.rest[j], bounds[j, self.others].max(axis=0)) if few else 0.0)
+            for j, size in enumerate(sizes)
         )
 
     def errors(self, sizes: Array) -> Array:
@@ -347,11 +353,15 @@ class RowResponse:
         """Support of the sum of the boxes |b_j| <= ``radii`` (N, n): shape (M, D)."""
         return np.asarray(self._sizes(radii) * (1 + _gamma(2 * self.nodes + self.dimension) * 2 + 1e-12))
 
-    def centres(self, values: Array) -> tuple[Array, Array]:
-        """The response to b_j = ``values`` (N, n), and a bound of its rounding error and of the other columns."""
+    def centred(self, values: Array, radii: Array) -> tuple[Array, Array]:
+        """The response to b_j = ``values`` (N, n), and the support of the boxes |b_j| <= ``radii`` around them.
+
+        The latter includes the rounding error of the former, and what the other columns do.
+        """
         total = self._gather(c @ values[j, self.columns] for j, c in enumerate(self.coefficients))
-        size = np.abs(values)
-        slack = self._sizes(size) * (_gamma(2 * self.nodes + self.dimension) * 2) + _TINY
+        size, rounding = np.abs(values), _gamma(2 * self.nodes + self.dimension) * 2
+        both = self._sizes(np.stack([radii, size], axis=-1))
+        slack = both[..., 0] * (1 + rounding + 1e-12) + both[..., 1] * rounding + _TINY
         if len(self.others):
             slack = slack + self._gather(
                 rest * size[j, self.others].max() for j, rest in enumerate(self.rest)) * (1 + 1e-12)

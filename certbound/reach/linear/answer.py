@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from contextlib import nullcontext
 
@@ -96,7 +97,7 @@ def _on_coarse_grids(
         run = run_of(problem, cells=1 if cells is None else cells, pieces=pieces)
         tries = ((target.part(part), effort) for part, effort in hopes_of(run, target))
         rough = (share for share in map(Share.of, shares.LIKELIER) if target.log < share.log)
-        for share, effort in (*tries, *((share, 2) for share in rough)):
+        for share, effort in itertools.chain(tries, ((share, 2) for share in rough)):
             if best is not None and share.log > target.log:
                 break
             if share.log > target.log and run.promise(share, effort, limit=_NOTHING) > _NOTHING:

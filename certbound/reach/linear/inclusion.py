@@ -143,8 +143,7 @@ class Supports:
         centre = np.einsum("kij,kj->ki", g.centre, middle)
         box = h * (radius + np.einsum("kij,kj->ki", g.first, radius)) + np.einsum("kij,kj->ki", g.second, size)
         box += 4 * (self.n + 4) * _UNIT * np.einsum("kij,kj->ki", np.abs(g.centre), size)
-        value, loss = self.response.centres(centre)
-        reach = self.response.boxes(box * _ROUND) + loss
+        value, reach = self.response.centred(centre, box * _ROUND)
         lower, upper = self._with_errors(value + reach, value - reach)
         own = None
         if self.continuous:

@@ -222,7 +222,7 @@ class Remainder(Derivatives):
                 break
             items, parts = boxes.items, expansion.parts(boxes)
             if curbed:
-                lo, hi = expansion.polytope_range(parts, boxes, asked.polytope)
+                lo, hi = expansion.polytope_range(parts, boxes, asked.polytope, asked.outputs)
             else:
                 lo, hi = expansion.plain_range(parts, boxes)
             np.fmax.at(inner_hi, items[inside], parts.middle[inside])

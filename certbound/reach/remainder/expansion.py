@@ -11,6 +11,7 @@ intervals; everything that is a radius is summed in floats and widened by a boun
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -334,8 +335,10 @@ class Expansion:
             linear[:, i] += (np.abs(parts.gradient[:, entry]) + parts.blur[:, entry]) * boxes.radius[:, a]
         return _closed(parts, linear, linear)
 
-    def polytope_range(self, parts: Parts, boxes: Boxes, polytope: Polytope) -> tuple[Array, Array]:
-        """Bounds of beta over the parts of boxes in the polytopes of their pieces: (Q, n)."""
+    def polytope_range(
+        self, parts: Parts, boxes: Boxes, polytope: Polytope, outputs: Sequence[int] | None = None
+    ) -> tuple[Array, Array]:
+        """Bounds of beta over the parts of boxes in the polytopes of their pieces: (Q, n); none beside ``outputs``."""
         items, centre, radius, n = boxes.items, boxes.centre, boxes.radius, parts.lower.shape[1]
         matrix = np.zeros((len(items), n, len(self.active)))
         matrix[:, self.of_output, self.of_state] = np.where(parts.bad[:, None], 0.0, parts.gradient)
@@ -348,7 +351,10 @@ class Expansion:
         above = high - value + slack + 1e-15 * np.abs(high)
         below = value - low + slack + 1e-15 * np.abs(low)
         normals, room = np.concatenate([own, -own], axis=1), np.concatenate([above, below], axis=1)
-        up, down = (linear_range(sign * matrix, radius, normals, room) for sign in (1.0, -1.0))
+        chosen = np.arange(n) if outputs is None else np.array(outputs)
+        up, down = np.full((2, len(items), n), np.inf)
+        for kept, sign in ((up, 1.0), (down, -1.0)):
+            kept[:, chosen] = linear_range(sign * matrix[:, chosen], radius, normals, room)
         return _closed(parts, down + blur, up + blur)
 
 

@@ -75,19 +75,20 @@ def linear_range(matrix: Array, radius: Array, normals: Array, room: Array) -> A
     """
     result = np.einsum("qna,qa->qn", np.abs(matrix), radius) * _WIDE + _LEAST
     reach = np.einsum("qda,qa->qd", np.abs(normals), radius)
-    box, face = np.nonzero(room < reach * (1 - 1e-12))
-    if not len(box):
+    useful = room < reach * (1 - 1e-12)
+    if not useful.any():
         return np.asarray(result)
-    g, w, b = matrix[box], normals[box, face], room[box, face]
-    weight = np.abs(w) * radius[box]
-    falls = g * w[:, None] > 0
-    slope = b[:, None] + reach[box, face][:, None] - 2 * np.einsum("pna,pa->pn", falls, weight)
-    pair, row = np.nonzero(slope < 0)
-    g, w, b, e = g[pair, row], w[pair], b[pair], radius[box[pair]]
-    alpha = _turning(g, w, falls[pair, row], weight[pair], slope[pair, row])
+    # at alpha = 0: b + sum |w| e, less twice the weights of the coordinates in which g falls
+    signs, weights = np.sign(matrix), normals * radius[:, None]
+    slopes = room[:, None] + reach[:, None] - np.abs(signs) @ np.abs(weights).swapaxes(1, 2)
+    slopes -= signs @ weights.swapaxes(1, 2)
+    box, row, face = np.nonzero((slopes < 0) & useful[:, None])
+    g, w, b, e = matrix[box, row], normals[box, face], room[box, face], radius[box]
+    falls, weight = g * w > 0, np.abs(weights[box, face])
+    alpha = _turning(g, w, falls, weight, slopes[box, row, face])
     value = (np.abs(g - alpha[:, None] * w) * e).sum(axis=-1) + alpha * b
-    size = (np.abs(g) * e).sum(axis=-1) + alpha * (weight[pair].sum(axis=-1) + np.abs(b))
-    np.minimum.at(result, (box[pair], row), value + 1e-13 * size + _LEAST)
+    size = (np.abs(g) * e).sum(axis=-1) + alpha * (weight.sum(axis=-1) + np.abs(b))
+    np.minimum.at(result, (box, row), value + 1e-13 * size + _LEAST)
     return np.asarray(result)
 
 

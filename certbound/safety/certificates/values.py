@@ -143,7 +143,8 @@ def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]
     if not found.proposed:
         raise CertificateError(
             "no value function was found that a certificate can state: in one state it states limits and noise that do "
-            "not come, go or jump, in two states bounded boxes, no obstacles and no oblique or curved limits."
+            "not come, go or jump, in two states bounded boxes whose faces paths cross, no obstacles and no oblique or "
+            "curved limits."
         )
     best = min(payment.log for _, payment in found.proposed)
     share = _COARSE[effort] * max(1.0, -0.1 * best)

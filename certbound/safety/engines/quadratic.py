@@ -30,8 +30,8 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     try:
         most = next((most for n, most in _SPARED.items() if problem.system.dimension <= n), _SECONDS)
         left = seconds_left()
-        named = asked.thorough and problem.system.dimension >= _FEW and left < math.inf
-        limit = max(left if named else min(_SECONDS if asked.thorough else most, left), _LEAST)
+        alone = asked.at_length or (asked.thorough and problem.system.dimension >= _FEW and left < math.inf)
+        limit = max(left if alone else min(_SECONDS if asked.thorough else most, left), _LEAST)
         best = bound_quadratic(
             problem, target=_ANY if asked.first else problem.delta, seconds=limit, before=asked.before,
             found=lambda bound: asked.found(_answer(bound)),

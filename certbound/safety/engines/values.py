@@ -12,7 +12,15 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import DiscreteSystem
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.values.chains import bound_chain, bound_drifting
-from certbound.values.continuous import ExitBounds, SureExit, bound_exits, bound_lasting, bound_rate, leaves_surely
+from certbound.values.continuous import (
+    ExitBounds,
+    SureExit,
+    bound_exits,
+    bound_lasting,
+    bound_rate,
+    is_confined,
+    leaves_surely,
+)  # fmt: skip
 from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
@@ -40,7 +48,7 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         if problem.system.time == "continuous" and problem.endless:
             return _lasting(problem)
         if problem.reach is None and serves(problem):
-            return _continuous(bound_exits_by_steps(problem, seconds=limit))
+            return _continuous(_confined(problem, limit) or bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
             answer = _continuous(_exits(problem, limit, spare=asked.bounded and not asked.thorough))
             return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer
@@ -153,6 +161,15 @@ def _failure(problem: Problem, limit: float) -> FailureBounds:
         return bound_chain(problem, seconds=min(2 * limit, seconds_left()), delta=problem.delta)
     except InfeasibleError as error:
         raise InfeasibleError(f"{refused.rstrip('.')}; and {error}") from error
+
+
+def _confined(problem: Problem, limit: float) -> ExitBounds | None:
+    """Splines where noise moves one state only, and no path crosses the other one's ends; None if they say nothing."""
+    try:
+        found = bound_exits(problem, seconds=limit, delta=problem.delta) if is_confined(problem) else None
+    except (InfeasibleError, EnclosureError):
+        return None
+    return found if found is not None and found.upper < 0 else None
 
 
 def _exits(problem: Problem, limit: float, *, spare: bool) -> ExitBounds:

@@ -3,7 +3,7 @@
 ``hypotheses`` says which function proves which hypothesis.
 """
 
-from certbound.values.continuous.exits import ExitBounds, bound_exits, chart_exits, chart_slabs_of
+from certbound.values.continuous.exits import ExitBounds, bound_exits, chart_exits, chart_slabs_of, is_confined
 from certbound.values.continuous.line import (
     Lasting,
     Rate,
@@ -19,5 +19,6 @@ from certbound.values.continuous.surface import Surface
 
 __all__ = [
     "ExitBounds", "Lasting", "Payment", "Rate", "SureExit", "Surface", "bound_exits", "bound_lasting",
-    "bound_mean_time", "bound_rate", "chart_exits", "chart_slabs_of", "faces_of", "leaves_surely", "starts_of",
+    "bound_mean_time", "bound_rate", "chart_exits", "chart_slabs_of", "faces_of", "is_confined", "leaves_surely",
+    "starts_of",
 ]

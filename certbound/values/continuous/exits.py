@@ -20,12 +20,12 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
 from certbound.values.continuous.coefficients import Reader, squared_diffusion
-from certbound.values.continuous.curved import bound_region, walled
+from certbound.values.continuous.curved import bound_region, boxed, walled
 from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import Model
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane import bound_moving, bound_windows, moving, windowed
-from certbound.values.continuous.room import safe_room
+from certbound.values.continuous.plane import bound_moving, bound_windows, confined, led, moving, windowed
+from certbound.values.continuous.room import limits_of, safe_room
 from certbound.values.continuous.surface import Surface
 
 _LN10 = math.log(10)
@@ -136,14 +136,14 @@ def bound_exits(
     elif windowed(problem):
         _refuse_random(problem)
         upper, least, words = bound_windows(problem, model, begin + seconds)
-    elif walled(problem):
+    elif walled(problem) and not (boxed(problem) and led(model)):
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)
     else:
         from certbound.values.continuous.plane import two_states
 
         _refuse_random(problem)
-        room = safe_room(problem)
+        room = limits_of(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
         upper, least, words, (proposed, below) = two_states(problem, model, room, begin + seconds, wanted)
     return ExitBounds(
@@ -151,6 +151,14 @@ def bound_exits(
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),
         proposed_below=tuple(below),
     )  # fmt: skip
+
+
+def is_confined(problem: Problem) -> bool:
+    """Whether noise moves one of two states only, and the drift keeps the other one in a box: splines serve that."""
+    if problem.system.time != "continuous" or problem.system.dimension != 2 or not boxed(problem):
+        return False
+    plain = not moving(problem) and not windowed(problem) and not problem.initial.random
+    return plain and problem.input_sequence is None and confined(problem, _model(problem), limits_of(problem))
 
 
 def chart_exits(

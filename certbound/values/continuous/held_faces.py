@@ -21,6 +21,11 @@ exp(L T - k (c - x_i)).
 
 *Proof.* exp(k X_i - L t), stopped where X leaves B, is a positive local supermartingale. QED.
 
+The same holds with a slope k(x_i) >= 0 that is continuous, piecewise linear and 0 up to some place after the start,
+where k f_i + (k^2 + k') a_ii / 2 <= L beyond that place: the probability is at most exp(L T) over the exponential of
+k's integral, which is C^1 with a bounded second derivative, so that Ito's formula holds. Where the drift leads back,
+k = -2 f_i / a_ii is as steep as the true one (Freidlin and Wentzell).
+
 `resolved` writes the model for one side of the face: max(x, 0) is x where x >= 0, and sqrt(u)^2 is u where the root is
 defined, which the tape goes on to ask (`squared_diffusion`).
 """
@@ -45,6 +50,9 @@ Ends = tuple[float, float]
 _PARTS = 16  # of the face in time and in every other state
 _BESIDE = 1e-3  # eta, in units of the box
 _SCANNED = 2001
+_ALONG = 192  # cells of a slope that varies
+_STEEPEST = 50.0  # what it may rise by over a cell
+_LEVELS = np.geomspace(0.1, 20.0, 8)  # of its rate, over the horizon
 _NIL = 1e-13  # of the largest a: what counts as vanishing, for candidates
 
 
@@ -176,30 +184,73 @@ def rarely_reached(
     gap = inner[0] - box[axis][0] if side == 0 else box[axis][1] - inner[1]
     if not gap > 0:
         return 0.0
-    times = 1 if model.autonomous else _PARTS
-    fine = [np.linspace(*ends, parts + 1) for ends, parts in zip((span, *box), (times, *[_PARTS] * len(box)))]
-    low = [cut.ravel() for cut in np.meshgrid(*(row[:-1] for row in fine), indexing="ij")]
-    high = [cut.ravel() for cut in np.meshgrid(*(row[1:] for row in fine), indexing="ij")]
-    cells = [Interval(a, b) for a, b in zip(low, high)]
-    drift, n = _output(model.drift.tape, axis), len(box)
+    length = Interval.point(span[1]) - Interval.point(span[0])
     try:
-        half = enclose(_output(model.square.tape, axis * n + axis), cells)[0][0] * Interval.point(0.5)
-        outward = [
-            enclose(drift, [*cells, *(one.broadcast_to(low[0].shape) for one in branch)])[0][0] * (2.0 * side - 1.0)
-            for branch in model.branches
-        ]
+        half, outward = _across(model, box, span, axis, side, np.linspace(*box[axis], _PARTS + 1))
+        room = _lengths(np.array(sorted((inner[side], box[axis][side]))))[0]
+        least = 0.0
+        for k in np.geomspace(1.0, 1e4, 41) / gap:
+            steep = Interval.point(k)
+            rate = float(((outward + half * steep) * steep).hi.max())
+            least = min(least, float((Interval.point(max(rate, 0.0)) * length - steep * room).hi))
+        places = np.linspace(inner[side], box[axis][side], _ALONG + 1)
+        half, outward = _across(model, box, span, axis, side, np.sort(places))
+        order = slice(None) if side == 1 else slice(None, None, -1)
+        climbs = (_climb(outward[order], half[order], places, level, length) for level in _LEVELS / length.mid)
+        least = min(least, *climbs)
     except EnclosureError:
         return 0.0
-    least = 0.0
-    for k in np.geomspace(1.0, 1e4, 41) / gap:
-        steep = Interval.point(k)
-        rate = max(float(((one + half * steep) * steep).hi.max()) for one in outward)
-        length = Interval.point(span[1]) - Interval.point(span[0])
-        room = Interval.point(inner[0] if side == 0 else box[axis][1]) - Interval.point(
-            box[axis][0] if side == 0 else inner[1]
-        )
-        least = min(least, float((Interval.point(max(rate, 0.0)) * length - steep * room).hi))
     return least if math.isfinite(least) else 0.0
+
+
+def _across(
+    model: Model, box: Sequence[Ends], span: Ends, axis: int, side: int, places: Array
+) -> tuple[Interval, Interval]:
+    """Upper bounds of a_ii / 2 and of the drift outward between places of an axis, shape (cells, parts of others)."""
+    times = 1 if model.autonomous else _PARTS
+    fine = [np.linspace(*ends, parts + 1) for ends, parts in zip((span, *box), (times, *[_PARTS] * len(box)))]
+    fine[1 + axis] = places
+    order = [1 + axis, *(k for k in range(len(fine)) if k != 1 + axis)]
+    low = np.meshgrid(*(fine[k][:-1] for k in order), indexing="ij")
+    high = np.meshgrid(*(fine[k][1:] for k in order), indexing="ij")
+    back = np.argsort(order)
+    cells = [Interval(low[k].ravel(), high[k].ravel()) for k in back]
+    drift, n = _output(model.drift.tape, axis), len(box)
+    half = enclose(_output(model.square.tape, axis * n + axis), cells)[0][0] * Interval.point(0.5)
+    size = cells[0].lo.shape
+    rates = [
+        enclose(drift, [*cells, *(one.broadcast_to(size) for one in branch)])[0][0] * (2.0 * side - 1.0)
+        for branch in model.branches
+    ]
+    shape = len(places) - 1, -1
+    tops = [np.broadcast_to(one.hi, size).reshape(shape) for one in (half, *rates)]
+    return Interval.point(tops[0]), Interval.point(np.max(tops[1:], axis=0))
+
+
+def _climb(outward: Interval, half: Interval, places: Array, level: float, length: Interval) -> float:
+    """The bound of the second lemma with a slope that rises from 0 as far as it may, at a rate of about ``level``."""
+    slope = [0.0]
+    for force, h, step in zip(outward.hi, np.maximum(half.hi, 1e-300), np.abs(np.diff(places))):
+        k, b = slope[-1], force + h / step  # both ends of the cell keep to the level
+        c = level + h * k / step
+        root = np.hypot(b, 2 * np.sqrt(h * c))
+        there = np.where(b > 0, 2 * c / np.maximum(root + b, 1e-300), (root - b) / (2 * h))
+        most = np.minimum(there, k + step * ((level - k * force) / h - k * k)).min()
+        slope.append(float(np.clip(most, 0.0, _STEEPEST / step)))
+    ends = [Interval.point(np.array(part)) for part in (slope[:-1], slope[1:])]
+    widths = _lengths(places)
+    bend = (ends[1] - ends[0]) / widths
+    noise = Interval(np.zeros(half.shape), half.hi)
+    # k is linear, and the inequality convex in it: it holds all over a cell if it does at both ends
+    rate = max(float((k[:, None] * outward + (k * k + bend)[:, None] * noise).hi.max()) for k in ends)
+    rise = ((ends[0] + ends[1]) * widths * Interval.point(0.5)).sum()
+    return float((Interval.point(max(rate, 0.0)) * length - rise).hi)
+
+
+def _lengths(places: Array) -> Interval:
+    """Distances between neighbours."""
+    first, second = Interval.point(places[:-1]), Interval.point(places[1:])
+    return second - first if places[-1] >= places[0] else first - second
 
 
 def _output(tape: Tape, output: int) -> Tape:

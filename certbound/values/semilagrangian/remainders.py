@@ -112,9 +112,10 @@ def remainders(
     first = jacobian(tape, (1, 2))
     second = jacobian(first, (1, 2))
     push = np.stack([np.zeros(size), np.full(size, noise * omega * math.sqrt(step) * _UP)])
-    stray = 1.3 * push + np.stack([step * push[1], np.zeros(size)])
     settled = np.zeros(size, dtype=bool)
-    tube, slopes = way, np.zeros((2, 2, *size))
+    tube = [Interval(w.lo - d, w.hi + d) for w, d in zip(way, push)]
+    slopes, _ = _magnitudes(first, tube)
+    stray = 1.3 * (push + step * np.einsum("ijn,jn->in", slopes, push))
     for _ in range(8):
         tube = [Interval(w.lo - d, w.hi + d) for w, d in zip(way, stray)]
         slopes, fine = _magnitudes(first, tube)
@@ -150,7 +151,15 @@ def _magnitudes(tape: Tape, tube: list[Interval]) -> tuple[Array, Mask]:
 
 
 def _exponential(matrix: Array) -> Array:
-    """Upper bound of the exponential of non-negative 2 x 2 matrices, shape (2, 2, N)."""
+    """Upper bound of the exponential of non-negative 2 x 2 matrices, shape (2, 2, N), whatever the units."""
+    cross = matrix[0, 1] + matrix[1, 0]
+    ratio = np.sqrt((matrix[0, 1] + 1e-6 * cross) / np.maximum(matrix[1, 0] + 1e-6 * cross, 1e-300))
+    unit = np.where(cross > 0, np.exp2(np.round(np.log2(np.maximum(ratio, 1e-9)))), 1.0)  # a power of 2: exact
+    units = np.stack([np.stack([np.ones_like(unit), unit]), np.stack([1 / unit, np.ones_like(unit)])])
+    return np.asarray(_balanced_exponential(matrix / units) * units)
+
+
+def _balanced_exponential(matrix: Array) -> Array:
     total = np.broadcast_to(np.eye(2)[..., None], matrix.shape).copy()
     term = total.copy()
     for k in range(1, 12):

@@ -24,8 +24,8 @@ def test_chosen_columns_and_repeated_rows_bound_what_is_driven(n: int) -> None:
     bounds = []
     for columns in (None, moved):
         found = RowResponse(response, 0, rows, columns)
-        value, slack = found.centres(middle)
-        reach = found.boxes(radius) + slack + found.errors(np.ones((steps + 1, n)))
+        value, reach = found.centred(middle, radius)
+        reach = reach + found.errors(np.ones((steps + 1, n)))
         bounds.append((value - reach, value + reach))
         np.testing.assert_array_equal(bounds[-1][1][:, 0], bounds[-1][1][:, 3])
     np.testing.assert_allclose(bounds[1], bounds[0], atol=1e-11)

@@ -353,3 +353,23 @@ def test_which_problems_are_served_and_what_the_others_are_told() -> None:
     problem = cb.Problem(lonely, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
     with pytest.raises(InfeasibleError, match="hardly reaches"):
         layout_of(setting_of(problem), Plan(count=10, fine=0.7, wide=0.01, cell=0.35, spare=1e-7))
+
+
+def pendulum_of(unit: float):
+    return lambda x: [x[1] * unit, -np.sin(x[0] / unit)]
+
+
+def test_remainders_do_not_depend_on_the_units_of_the_states() -> None:
+    """x in units 2^12 times as small: the flow's bounds are the same, in those units."""
+    unit = 2.0**12
+    kept = []
+    for factor in (1.0, unit):
+        system = cb.ContinuousSystem(pendulum_of(factor), states=2, diffusion=[[0.0], [0.5]])
+        asked = mechanical(lambda x: -x[0], 0.5, [-1, -2], [1, 2])
+        tape = setting_of(asked.replace(system=system)).tape
+        ends = [np.array([low]) for low in (0.25, 0.5)]
+        p, q = (Interval(low, low + 0.125) for low in ends)
+        found = remainders(tape, 0.5, p * factor, q, step=0.25, omega=8.0, chord=4.0)
+        assert found.known.all()
+        kept.append(np.concatenate([found.most[:, 0], found.mean[:, 0]]) / np.tile([factor, 1.0], 2))
+    assert np.allclose(kept[0], kept[1], rtol=0.02)

@@ -5,6 +5,6 @@ From the bottom: ``boundaries`` (what is safe, in outward-rounded arithmetic), `
 """
 
 from certbound.values.continuous.curved.bounding import bound_region
-from certbound.values.continuous.curved.region import walled
+from certbound.values.continuous.curved.region import boxed, walled
 
-__all__ = ["bound_region", "walled"]
+__all__ = ["bound_region", "boxed", "walled"]

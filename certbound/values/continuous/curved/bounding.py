@@ -15,7 +15,6 @@ import numpy as np
 
 from certbound.arrays import Array, Index
 from certbound.errors import InfeasibleError
-from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region as Set
 from certbound.values.continuous.curved.boundaries import Walls
@@ -30,6 +29,7 @@ from certbound.values.continuous.plane import (
     Plane,
     Source,
     bound_plane_above,
+    floats_of,
     held_plane,
     released,
     rough_level,
@@ -91,15 +91,7 @@ def _setting(problem: Problem, model: Model) -> tuple[Plane, Region, float, Mode
 
     Without walls the box ends at faces that no path crosses, and the model is written for their inner side.
     """
-    drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
-    corners = [[float(value.mid) for value in branch] for branch in model.branches]
-
-    def drifts(t: float, x: Array, y: Array) -> Array:
-        return np.array([np.moveaxis(drift(t, x, y, *corner), -1, 0) for corner in corners])
-
-    def squares(t: float, x: Array, y: Array) -> Array:
-        return np.moveaxis(square(t, x, y), (-2, -1), (0, 1))
-
+    drifts, squares = floats_of(model)
     found = []
     for near in (False, True):
         region = region_of(problem, drifts, squares, near=near)

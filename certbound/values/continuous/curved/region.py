@@ -28,10 +28,15 @@ class Region:
 def walled(problem: Problem) -> bool:
     """Whether the safe set of a problem in the plane is more than a box: obstacles, other limits, or a missing one."""
     kept = problem.constraints
-    if any(constraint.outside or not _square(constraint) for constraint in kept):
+    if not boxed(problem):
         return True
     sides = np.vstack([np.eye(2), -np.eye(2)])
     return bool(np.isinf(np.min([constraint.region.support(sides) for constraint in kept], axis=0)).any())
+
+
+def boxed(problem: Problem) -> bool:
+    """Whether all limits lie along the coordinates."""
+    return all(not constraint.outside and _square(constraint) for constraint in problem.constraints)
 
 
 def _square(constraint: Inside) -> bool:

@@ -7,7 +7,7 @@ for windows, and ``frames`` for limits that move.
 
 from certbound.values.continuous.plane.frames import bound_moving, moving
 from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
-from certbound.values.continuous.plane.plane_reach import Floats, reach_of
+from certbound.values.continuous.plane.plane_reach import Floats, floats_of, led, reach_of
 from certbound.values.continuous.plane.plane_targets import bound_failing
 from certbound.values.continuous.plane.plane_windows import bound_windows
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
@@ -15,6 +15,7 @@ from certbound.values.continuous.plane.stages import windowed
 from certbound.values.continuous.plane.two_sides import (
     bound_plane_above,
     chart_plane,
+    confined,
     held_plane,
     released,
     rough_level,
@@ -23,6 +24,6 @@ from certbound.values.continuous.plane.two_sides import (
 
 __all__ = [
     "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
-    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "reach_of", "released", "rough_level",
-    "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
+    "bound_windows", "chart_plane", "confined", "floats_of", "held_plane", "integrated", "led", "moving", "reach_of",
+    "released", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
 ]

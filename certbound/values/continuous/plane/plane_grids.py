@@ -18,6 +18,7 @@ Pair = tuple[float, float]
 Sides = tuple[bool, bool]
 
 _THINNEST = 0.2
+_SPARSE = 6.0  # how fast cells grow outside of where simulated paths go, in units of its extent
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -33,6 +34,7 @@ class Plane:
     autonomous: bool
     nodes: tuple[Array, Array] | None = None
     held: tuple[Sides, Sides] = ((False, False), (False, False))  # faces that no path crosses
+    visited: tuple[Pair, Pair] | None = None  # where simulated paths go, along each axis: cells are larger elsewhere
 
     def across(self, axis: int, place: list[Array], t: float) -> Array:
         """a's entry across a face, not below a small share of its largest value where it may vanish."""
@@ -121,6 +123,9 @@ def spread_nodes(plane: Plane, plan: Plan, axis: int, more: Callable[[Array], Ar
         weight = 1 / (distance + 1 / layer_rate(plane, plan, axis, side))
         density += 0.5 * weight / np.trapezoid(weight, fine)
     density = density if more is None else density * more(fine)
+    if plane.visited is not None:
+        least, most = plane.visited[axis]
+        density = density / (1 + _SPARSE * np.maximum(np.maximum(least - fine, fine - most), 0.0) / (most - least))
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     nodes = np.interp(np.linspace(0, total[-1], plan.cells + 1), total, fine)
     nodes[0], nodes[-1] = low, high
@@ -133,7 +138,7 @@ def mean_deviation(plane: Plane, axis: int, places: Array) -> Array:
     x, y = np.meshgrid(places, others, indexing="ij") if axis == 0 else np.meshgrid(others, places, indexing="ij")
     square = plane.square(plane.horizon, x, y)[axis, axis] * np.ones(x.shape)
     root = np.sqrt(np.maximum(square, 0.0)).mean(axis=1 - axis)
-    return np.asarray(np.maximum(root, 0.2 * root.max()))
+    return np.asarray(np.maximum(root, 0.2 * root.max()) if root.max() > 0 else np.ones(root.shape))
 
 
 def layer_rate(plane: Plane, plan: Plan, axis: int, side: int) -> float:

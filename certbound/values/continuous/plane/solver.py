@@ -32,6 +32,7 @@ from certbound.watch import poll
 
 _GAMMA = 0.5
 _COURANT = 1.5
+_GIVEN = 10.0  # how far V is below 0 where paths go, where no plan says so
 _GATE = 0.004  # a source weakens where V is above minus this, and ends at 0
 _MOST_STEPS = 40_000
 _PER_SLAB = 80  # on average, beyond which steps are a sign of oscillations
@@ -130,12 +131,26 @@ class Solver:
                 rate, bend, curve = self._layer(axis, side)
                 depth = rate * (place - self.plane.low[axis] if side == 0 else self.plane.high[axis] - place)
                 sides.append(np.log1p(bend * depth) + 0.5 * curve * depth**2 * np.exp(-depth) - depth)
+        sides += self._given_up()
         far = np.logaddexp.reduce(sides)
         with np.errstate(divide="ignore"):  # 1 - the product of 1 - exp(side), which far from the faces is the sum
             near = np.log(-np.expm1(np.sum([np.log1p(-np.exp(np.minimum(side, 0.0))) for side in sides], axis=0)))
         value = np.logaddexp(np.where(far < -15, far, near), self.plan.floor)
         value[self.edge] = 0.0
         return np.asarray(value)
+
+    def _given_up(self) -> list[Array]:
+        """V rises to 0 at T also between where paths go and a held face far beyond: fronts there would cost much."""
+        if self.plane.visited is None:
+            return []
+        depth = max(-self.plan.floor, 1.0) if self.plan.floor > -math.inf else _GIVEN
+        found = []
+        for axis, place in enumerate((self.x, self.y)):
+            least, most = self.plane.visited[axis]
+            for side, beyond in ((0, least - place), (1, place - most)):
+                if self.plane.held[axis][side]:
+                    found.append(-np.logaddexp(0.0, depth * (1 - 2 * beyond / (most - least))))
+        return found
 
     def _layer(self, axis: int, side: int) -> tuple[float, Array, Array]:
         """k, c and b of the layer (1 + c k d) exp(b (k d)^2 exp(-k d) / 2 - k d); a u'' / 2 + f u' = 0 on the face."""

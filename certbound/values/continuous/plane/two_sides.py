@@ -19,7 +19,6 @@ from functools import partial
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.charts import Chart
 from certbound.values.continuous.held_faces import check_noise, held_face, rarely_reached, resolved
@@ -38,7 +37,7 @@ from certbound.values.continuous.plane.monotone import propose_monotone
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
-from certbound.values.continuous.plane.plane_reach import reach_of
+from certbound.values.continuous.plane.plane_reach import closed_plane, floats_of, led, reach_of
 from certbound.values.continuous.room import Room, limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
@@ -64,7 +63,8 @@ _FLOORS = (-7.0, -20.0, -50.0)
 _FIRST = 0.02  # of the lead: slabs start shorter there
 _SLOPING = (-0.3,)  # and sources leave the cells at the faces alone, whose layers they would bend
 _RARE = 5.0  # how far below log P is what faces may be left out for
-_NEARER = (0.1, 0.2, 0.35, 0.6, 1.0)  # of the way to a face, where one is wanted that hardly a path reaches
+_NEARER = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)  # of the way to a face, where one is wanted that hardly a path reaches
+_VISITED = 0.05  # as next, of where cells are small
 _BEYOND = 0.35  # how far beyond simulated paths a box ends, in units of their extent
 _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 BELOW = 0.6  # of as many patches again, for a lower bound
@@ -80,7 +80,12 @@ def two_states(
     """
     starts = starts_of(problem)
     plain, rare = model, -math.inf
+    limited = bool(np.isfinite([*room.inner_low, *room.inner_high]).all())
+    room = closed_plane(problem, model, room)
     inner, model = held_plane(plane_of(problem, model, room.inner_low, room.inner_high, starts), model)
+    if led(model):
+        visited = np.transpose(reach_of(problem, inner.drift, inner.square, _VISITED))
+        inner = replace(inner, visited=((visited[0, 0], visited[0, 1]), (visited[1, 0], visited[1, 1])))
     if held_anywhere(inner):
         inner, written, rare = released(problem, inner, plain, rough_level(inner))
         model = written or model
@@ -88,13 +93,13 @@ def two_states(
         inner = near if rough_level(near) < rough_level(inner) + _ALIKE else inner
     else:
         check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
-        if wanted < math.inf:
+        if wanted < math.inf and limited:
             check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = rough_level(inner)
     upper, done, proposed = bound_plane_above(inner, model, level, patches, rare)
     below: list[Proposed] = []
-    if upper > wanted and not held_anywhere(inner):
+    if upper > wanted and limited and not held_anywhere(inner):
         outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
         plan = plan_below(outer, min(level, upper), BELOW * patches)
         with contextlib.suppress(OutOfTime):
@@ -103,6 +108,15 @@ def two_states(
         done.append(f"{plan.cells}^2 below")
     lower = max((payment.log for _, payment in below), default=None)
     return upper, lower, f"value function in two states, cells: {', '.join(done)}", (proposed, below)
+
+
+def confined(problem: Problem, model: Model, room: Room) -> bool:
+    """Whether noise moves one state only, and no path crosses the ends of the other one."""
+    if not led(model):
+        return False
+    room = closed_plane(problem, model, room)
+    plane, _ = held_plane(plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem)), model)
+    return any(all(sides) for sides in plane.held)
 
 
 def bound_plane_above(
@@ -114,6 +128,7 @@ def bound_plane_above(
     """
     upper, done = 0.0, []
     proposed: list[Proposed] = []
+    stated = rare == -math.inf and not held_anywhere(plane)  # certificates know of no face that paths do not cross
     plans = {plan.cells: plan for plan in (_plan(plane, level, share * patches) for share in _SHARES)}
     kinds: list[Propose] = [propose_plane] if held_anywhere(plane) else _several()
     for plan in plans.values():
@@ -124,7 +139,7 @@ def bound_plane_above(
                 paid = with_rare(payment, rare)
                 if paid < upper:
                     upper = paid
-                    proposed += [(raised_above(surface, plane.held), payment)] if rare == -math.inf else []
+                    proposed += [(raised_above(surface, plane.held), payment)] if stated else []
         except OutOfTime:
             if upper < 0:
                 break
@@ -365,14 +380,8 @@ def _near(problem: Problem, plane: Plane) -> Plane:
 def plane_of(
     problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]
 ) -> Plane:
-    drift, square = compile_numpy(model.drift.tape), compile_numpy(model.square.tape)
-    corners = [[float(value.mid) for value in branch] for branch in model.branches]
-
-    def drifts(t: float, x: Array, y: Array) -> Array:
-        return np.array([np.moveaxis(drift(t, x, y, *corner), -1, 0) for corner in corners])
-
+    drift, square = floats_of(model)
     return Plane(
-        low=(low[0], low[1]), high=(high[0], high[1]), horizon=float(problem.horizon), drift=drifts,
-        square=lambda t, x, y: np.moveaxis(square(t, x, y), (-2, -1), (0, 1)), starts=starts,
-        autonomous=model.autonomous,
+        low=(low[0], low[1]), high=(high[0], high[1]), horizon=float(problem.horizon), drift=drift, square=square,
+        starts=starts, autonomous=model.autonomous,
     )  # fmt: skip
