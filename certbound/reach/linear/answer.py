@@ -24,7 +24,7 @@ _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
 _MOST_PIECES = 4000  # pieces of time times cells
 _FEW = 3  # states up to which cells of the start are looked at without being asked thoroughly
 _AT_ONCE = 3  # states from which on that is at once: with fewer, polynomials and metrics are quick, and may say more
-_EARLY = 0.2  # of the time that is left, for them
+_EARLY = 0.35  # of the time that is left, for them
 
 
 def refusal(problem: Problem) -> str | None:

@@ -9,9 +9,7 @@ Where even its middle alone, as a start, is out of reach, no halving helps.
 from __future__ import annotations
 
 import contextlib
-import heapq
-import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -25,7 +23,7 @@ from certbound.reach.linear.hopes import meeting, promising, refined, run_of
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.proved import LinearAnswer, SplitAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
-from certbound.reach.linear.shares import Share
+from certbound.reach.linear.shares import GUESSED, Share
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.rigor.intervals import Interval
 from certbound.watch import executor_lent, jobs_allowed, poll
@@ -136,79 +134,71 @@ class Bisection:
     takes over what those that it is a part of found out, so that the answer is the same whoever comes first.
     """
 
-    def __init__(self, whole: LinearRun, target: Share, workers: Staff) -> None:
-        self.problem, self.whole, self.target, self.workers = whole.engine.problem, whole, target, workers
+    def __init__(self, whole: LinearRun, target: Share) -> None:
+        self.problem, self.whole, self.target = whole.engine.problem, whole, target
         self.pieces = whole.engine.pieces if whole.engine.continuous else None
         boxes = initial_cells(self.problem).boxes
         self.root = _Leaf(np.array(boxes.lo[0]), np.array(boxes.hi[0]))
         self.middle = self.root.middle
         self.wide = int(np.count_nonzero(self.root.low < self.root.high))
-        self.halves: tuple[_Leaf, ...] = ()
-        self.hoped: Share | None = None
-        self.flying: set[_Leaf] = set()
-        if self.wide and workers.apart:
-            self._ask(self.middle, _Hint())
+        self.open: dict[_Leaf, tuple[float, _Hint]] = {self.middle: (np.inf, _Hint())} if self.wide else {}
+        self.done: list[_Proof] = []
+        self.count = 1
+        self.workers: Staff
+        self.flying: dict[_Leaf, bool]
 
     @classmethod
     @contextlib.contextmanager
     def of(cls, whole: LinearRun, target: Share) -> Iterator[Bisection]:
-        """With as many processes as are allowed."""
-        pieces = whole.engine.pieces if whole.engine.continuous else None
-        with staff(partial(_look, whole.engine.problem, pieces, target), jobs_allowed(), executor_lent()) as workers:
-            yield cls(whole, target, workers)
+        """With as many processes as are allowed; what time ended goes on where it was."""
+        found: Bisection = whole.halving or cls(whole, target)
+        whole.halving = found
+        asked = partial(_look, found.problem, found.pieces, target)
+        with staff(asked, jobs_allowed(), executor_lent()) as found.workers:
+            found.flying = {}
+            if found.workers.apart and found.middle in found.open:
+                found._ask(found.middle)
+            yield found
 
-    def begin(self) -> None:
+    def begin(self, *, look: bool = True) -> None:
         """Let others, if there are any, look at the halves."""
-        if self.wide and not self.halves:
-            self._halve()
-            for leaf in self.halves if self.workers.apart else ():
-                self._ask(leaf, _Hint(self.hoped), hands=self.workers.width - 1)
-
-    def _halve(self) -> None:
-        self.hoped, self.halves = self.whole.hoped, self.root.halves(_side(self.whole))
+        if self.wide and self.count == 1:
+            halves = self.root.halves(_side(self.whole))
+            self.open |= dict.fromkeys(halves, (0.0, _Hint(self.whole.hoped)))
+            self.count += len(halves)
+            for leaf in halves if look and self.workers.apart else ():
+                self._ask(leaf, hands=self.workers.width - 1)
 
     def proved(self) -> SplitAnswer | None:
         """All cells; None where the target is out of reach, or takes too many of them."""
+        self.begin(look=False)
         if not self.wide:
             return None
-        heap: list[tuple[float, int, _Leaf, _Hint]] = []
-        done: list[_Proof] = []
-        count = 3
-
-        def later(leaves: Iterable[_Leaf], urgency: float, hint: _Hint) -> None:
-            for leaf in leaves:
-                heapq.heappush(heap, (-urgency, next(order), leaf, hint))
-
-        order = itertools.count()
-        if not (self.halves and self.workers.apart):
-            if not self.halves:
-                self._halve()
-            later(self.halves, 0.0, _Hint(self.hoped, self.whole.learnt))
-        if not self.workers.apart:
-            self._ask(self.middle, _Hint())
-        while heap or self.flying:
-            poll(f"cells of the initial set: {len(done)} done, {len(heap) + len(self.flying)} to do")
-            while heap and len(self.flying) < self.workers.width:
-                _, _, leaf, hint = heapq.heappop(heap)
-                self._ask(leaf, hint, proving=True)
-            for leaf, seen in self._finished():
-                hint = _Hint(seen.hint.hoped, self.whole.learnt if seen.hint.learnt is None else seen.hint.learnt)
+        while self.open:
+            poll(f"cells of the initial set: {len(self.done)} done, {len(self.open)} to do")
+            while len(self.flying) < min(self.workers.width, len(self.open)):
+                waiting = (leaf for leaf in self.open if leaf not in self.flying)
+                self._ask(most := max(waiting, key=lambda leaf: self.open[leaf][0]), proving=most is not self.middle)
+            for leaf, seen, looked in self._finished():
+                if looked and leaf is not self.middle and (seen.promising or self._lost):
+                    continue
+                del self.open[leaf]
                 if seen.found is not None:
-                    done.append((leaf, seen))
-                elif seen.promising:  # which was all that was asked
-                    if leaf is not self.middle:
-                        later([leaf], 0.0, _Hint(self.hoped, self.whole.learnt))
-                elif leaf is self.middle or seen.hopeless or len(leaf.path) >= _DEPTH * self.wide:
+                    self.done.append((leaf, seen))
+                elif leaf is not self.middle:
+                    if seen.hopeless or len(leaf.path) >= _DEPTH * self.wide:
+                        return None
+                    self.open |= dict.fromkeys(leaf.halves(seen.side), (seen.urgency, seen.hint))
+                    self.count += 2
+                elif not seen.promising:
                     return None
-                else:
-                    count += 2
-                    later(leaf.halves(seen.side), seen.urgency, hint)
-            if count * self.whole.engine.pieces > _MOST_PIECES:
+            if self.count * self.whole.engine.pieces > _MOST_PIECES:
                 return None
+        done = self.done
         if not self.whole.engine.continuous:  # elsewhere events are dear
             work = self.whole.engine.pieces * self.whole.engine.n**2
-            done = self._further(done, min(_SPARE // work - count, _MORE * count))
-        done.sort(key=lambda item: item[0].path)
+            done = self._further(done, min(_SPARE // work - self.count, _MORE * self.count))
+        done = sorted(done, key=lambda item: item[0].path)
         return SplitAnswer.of([
             (leaf.path, leaf.low, leaf.high, seen.answer(self.problem, leaf, self.pieces)) for leaf, seen in done
         ])
@@ -221,25 +211,34 @@ class Bisection:
                 break
             poll(f"cells of the initial set: {len(done)} done, halving the worst")
             for half in leaf.halves(seen.side):
-                self._ask(half, _Hint(), proving=True)
+                self._ask(half, proving=True)
             halves: list[_Proof] = []
             while self.flying:
                 poll()
-                halves += self._finished()
+                halves += [(half, seen) for half, seen, _ in self._finished()]
             if max(half.level for _, half in halves) >= seen.level:
                 break
             done = [item for item in done if item is not worst] + halves
             spare -= 2
         return done
 
-    def _ask(self, leaf: _Leaf, hint: _Hint, proving: bool = False, hands: int | None = None) -> None:
-        self.flying.add(leaf)
+    @property
+    def _lost(self) -> bool:
+        """Whether the whole's remainder could not be enclosed: its halves begin with the share that asks for least."""
+        return bool(np.isfinite(self.whole.lost))
+
+    def _ask(self, leaf: _Leaf, proving: bool = False, hands: int | None = None) -> None:
+        hint = self.open[leaf][1] if leaf in self.open else _Hint()
+        if proving and leaf in self.open:
+            hoped = self.target.part(GUESSED[-1][0]) if self._lost and len(leaf.path) == 1 else hint.hoped
+            hint = _Hint(hoped, self.whole.learnt if hint.learnt is None else hint.learnt)
+        self.flying[leaf] = proving
         self.workers.begin(leaf, leaf, hint, proving, hands=hands)
 
-    def _finished(self) -> Iterator[_Proof]:
+    def _finished(self) -> Iterator[tuple[_Leaf, _Seen, bool]]:
+        """Cells, what became of them, and whether they were looked at only."""
         for leaf, answer in self.workers.finished():
-            self.flying.remove(leaf)
-            yield leaf, result_of(answer)
+            yield leaf, result_of(answer), not self.flying.pop(leaf)
 
 
 def _shares(run: LinearRun) -> Array:

@@ -57,7 +57,8 @@ class LinearRun(Inclusion):
     """One evaluation of the engine: the inclusion for the remainder, the events, and their room.
 
     ``hoped`` is the delta_N that promised most, here or in a run much like this one, and ``lost`` the logarithm of the
-    largest one at which the remainder could not be enclosed; ``parted``: cells of the starts were tried in vain.
+    largest one at which the remainder could not be enclosed; ``parted``: cells of the starts were tried in vain;
+    ``halving``: what is proved of them so far.
     """
 
     def __init__(self, engine: Linearisation) -> None:
@@ -65,6 +66,7 @@ class LinearRun(Inclusion):
         self.hoped: Share | None = None
         self.lost = -np.inf
         self.parted = False
+        self.halving: Any = None
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[Share, tuple[Array, list[Events]]] = {}
