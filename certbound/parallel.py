@@ -13,16 +13,17 @@ import multiprocessing
 import os
 import threading
 import warnings
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from concurrent.futures import wait as first_of
+from functools import partial
 from multiprocessing.connection import Connection, wait
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from certbound.errors import EngineError, SolverError
-from certbound.watch import OutOfTime, Watch, poll, seconds_left, silenced, undisturbed
+from certbound.watch import OutOfTime, Watch, seconds_left, silenced, undisturbed
 
-T = TypeVar("T")
 Answer = tuple[Any, BaseException | None]
 """What a task returned, or what it raised."""
 
@@ -46,38 +47,53 @@ class Crew(Protocol):
     def close(self) -> None: ...
 
 
+class Staff(Protocol):
+    """Who is given arguments under a key; ``apart``: whether this process is free for work of its own meanwhile."""
+
+    width: int
+    apart: bool
+
+    def begin(self, key: Hashable, *arguments: Any, hands: int | None = None) -> None: ...
+
+    def finished(self) -> list[tuple[Any, Answer]]: ...
+
+
 @contextlib.contextmanager
 def crew(jobs: int, executor: Any = None) -> Iterator[Crew]:
     """Copies of this process, ``jobs`` at a time, or an executor; what is unfinished at the end is given up."""
-    copies = "fork" in multiprocessing.get_all_start_methods()
     with contextlib.nullcontext() if executor is None else lent(executor) as taken:
-        found: Crew = _Pool(*taken) if taken is not None else _Copies(jobs) if copies else _Nobody()
+        found: Crew = _Pool(*taken) if taken is not None else _Copies(jobs) if _can_copy() else _Nobody()
         try:
             yield found
         finally:
             found.close()
 
 
-def side_by_side(tasks: Sequence[Callable[[], T]], jobs: int, executor: Any = None) -> list[T]:
-    """What the tasks return, in their order: the same whatever ``jobs``, the number that run at a time.
+@contextlib.contextmanager
+def staff(work: Callable[..., Any], jobs: int, executor: Any = None) -> Iterator[Staff]:
+    """Who calls one function with one task's arguments after the other's: the same answers whoever it is.
 
-    A task is called in a copy of this process, or on an executor that it is pickled for, and what it returns is
-    pickled, so that nothing else that it does is seen here. One process does all where there is one task or job, or
-    where the system cannot copy processes. ``OutOfTime`` ends them all; what else a task raises is raised here.
+    Copies of this process that stay, ``jobs`` at a time, which are sent arguments and send answers back, both pickled;
+    or an executor, for which the function is pickled too. One process does all where there is one job, or where the
+    system cannot copy processes.
     """
-    if len(tasks) < 2 or (executor is None and jobs < 2):
+    found: Staff
+    if executor is not None:
+        with crew(jobs, executor) as taken:
+            yield _Asked(work, taken)
+    elif jobs < 2 or not _can_copy():
         with alone():
-            return [task() for task in tasks]
-    found: dict[int, T] = {}
-    waiting = list(enumerate(tasks))
-    with crew(jobs, executor) as workers:
-        while len(found) < len(tasks):
-            while waiting and len(tasks) - len(waiting) - len(found) < workers.width:
-                workers.begin(*waiting.pop(0))
-            for index, answer in workers.finished():
-                found[index] = result_of(answer)
-            poll()
-    return [found[index] for index in range(len(tasks))]
+            yield _Asked(work, _Nobody())
+    else:
+        found = _Servants(work, jobs)
+        try:
+            yield found
+        finally:
+            found.close()
+
+
+def _can_copy() -> bool:
+    return "fork" in multiprocessing.get_all_start_methods()
 
 
 def result_of(answer: Answer) -> Any:
@@ -125,14 +141,9 @@ class _Copies:
         self._running: dict[Connection, tuple[Hashable, Any]] = {}
 
     def begin(self, key: Hashable, task: Callable[[], Any]) -> None:
-        ours, theirs = multiprocessing.Pipe(duplex=False)
-        process = multiprocessing.get_context("fork").Process(target=_work, args=(task, theirs), daemon=True)
         with undisturbed():  # what is interrupted at the fork loses the process, or its locks
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DeprecationWarning)  # of copies beside a thread that only writes lines
-                process.start()
-            self._running[ours] = key, process
-        theirs.close()
+            pipe, process = _copied(_work, task)
+            self._running[pipe] = key, process
 
     def finished(self) -> list[tuple[Any, Answer]]:
         found = []
@@ -140,14 +151,74 @@ class _Copies:
             assert isinstance(pipe, Connection)
             key, process = self._running.pop(pipe)
             found.append((key, _received(pipe)))
+            pipe.close()
             process.join()
         return found
 
     def close(self) -> None:
-        for pipe, (_, process) in self._running.items():
-            process.kill()
-            process.join()
-            pipe.close()
+        _ended((pipe, process) for pipe, (_, process) in self._running.items())
+
+
+class _Servants:
+    """Copies of this process that stay until the end; arguments wait in the pipe of one that is at work."""
+
+    apart = True
+
+    def __init__(self, work: Callable[..., Any], jobs: int) -> None:
+        self.width = jobs
+        self._work = work
+        self._processes: dict[Connection, Any] = {}
+        self._given: dict[Connection, deque[Hashable]] = {}
+
+    def begin(self, key: Hashable, *arguments: Any, hands: int | None = None) -> None:
+        """Give it to whoever has the least to do of ``hands`` processes (all)."""
+        pipe = min(self._given, key=lambda one: len(self._given[one]), default=None)
+        if pipe is None or (self._given[pipe] and len(self._given) < (hands or self.width)):
+            with undisturbed():
+                pipe, process = _copied(_serve, self._work)
+                self._processes[pipe], self._given[pipe] = process, deque()
+        self._given[pipe].append(key)
+        with contextlib.suppress(BrokenPipeError):  # of one that was ended: its answer says so
+            pipe.send(arguments)
+
+    def finished(self) -> list[tuple[Any, Answer]]:
+        at_work = [pipe for pipe, keys in self._given.items() if keys]
+        return [(self._given[pipe].popleft(), _received(pipe)) for pipe in wait(at_work, _LOOK)]  # type: ignore[index,arg-type]
+
+    def close(self) -> None:
+        _ended(self._processes.items())
+
+
+class _Asked:
+    """A crew that calls one function."""
+
+    apart = False
+
+    def __init__(self, work: Callable[..., Any], workers: Crew) -> None:
+        self.width = workers.width
+        self._work, self._workers = work, workers
+        self.finished = workers.finished
+
+    def begin(self, key: Hashable, *arguments: Any, hands: int | None = None) -> None:
+        self._workers.begin(key, partial(self._work, *arguments))
+
+
+def _copied(target: Callable[[Any, Connection], None], given: Any) -> tuple[Connection, Any]:
+    """Our end of a pipe to a copy of this process, which calls ``target`` with what is given and its end; the copy."""
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("fork").Process(target=target, args=(given, theirs), daemon=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of copies beside a thread that only writes lines
+        process.start()
+    theirs.close()
+    return ours, process
+
+
+def _ended(copies: Iterable[tuple[Connection, Any]]) -> None:
+    for pipe, process in copies:
+        process.kill()
+        process.join()
+        pipe.close()
 
 
 class _Nobody:
@@ -209,6 +280,14 @@ def _of(future: Future[Answer]) -> Answer:
         return None, LostError(f"the worker of a part was lost ({type(error).__name__}: {error}).")
 
 
+def _serve(work: Callable[..., Any], pipe: Connection) -> None:
+    """In the copy: an answer for each tuple of arguments."""
+    silenced()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    while True:
+        pipe.send(_answer(partial(work, *pipe.recv())))
+
+
 def _work(task: Callable[[], Any], pipe: Connection) -> None:
     """In the copy: the answer of a task."""
     silenced()
@@ -229,11 +308,9 @@ def _end_with_parent() -> None:
 def _received(pipe: Connection) -> Answer:
     try:
         answer: Answer = pipe.recv()
-    except EOFError:
+    except (EOFError, ConnectionResetError):
         words = "a process at work on a part was ended; give it fewer jobs, or more memory."
         return None, LostError(words)
-    finally:
-        pipe.close()
     return answer
 
 

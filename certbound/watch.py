@@ -91,8 +91,8 @@ class Watch:
         self.log10_lower: float | None = None
 
     def silence(self) -> None:
-        """Tell no more."""
-        self._progress = None
+        """Tell no more, and interrupt nothing for others."""
+        self._progress = self._alarm = None
 
     @property
     def spent(self) -> float:
@@ -277,7 +277,7 @@ def undisturbed() -> Iterator[None]:
 
 
 def silenced() -> None:
-    """Let the watch that runs, if any, tell no more: in a copy of the process, whose own timers are heard."""
+    """Let the watch that runs, if any, only end the work: in a copy of the process, whose own timers are heard."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})
     watch = _CURRENT.get()

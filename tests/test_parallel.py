@@ -10,8 +10,8 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,41 +19,83 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import certbound as cb
 from certbound.errors import EngineError, SolverError
-from certbound.parallel import LostError, side_by_side
-from certbound.watch import OutOfTime, Watch
+from certbound.parallel import Answer, LostError, result_of, staff
+from certbound.watch import OutOfTime, Watch, poll
 from tests.reach.linear.test_bisection import flattening
 
 
-def squares(count: int) -> list[Callable[[], tuple[int, int]]]:
-    return [lambda k=k: (k * k, os.getpid()) for k in range(count)]
+def square(k: int) -> tuple[int, int]:
+    return k * k, os.getpid()
+
+
+def asked(work: Callable[[int], object], count: int, jobs: int, executor: Any = None) -> list[Answer]:
+    """The answers of one function to 0, ..., count - 1, in order."""
+    found: dict[int, Answer] = {}
+    with staff(work, jobs, executor) as workers:
+        for k in range(count):
+            workers.begin(k, k)
+        while len(found) < count:
+            found |= dict(workers.finished())
+            poll()
+    return [found[k] for k in range(count)]
+
+
+def sleep(_: int) -> None:
+    time.sleep(60)
 
 
 @pytest.mark.parametrize("jobs", [1, 2, 5])
-def test_answers_come_in_order_from_as_many_processes(jobs: int) -> None:
-    found = side_by_side(squares(4), jobs)
-    assert [square for square, _ in found] == [0, 1, 4, 9]
-    assert ({process for _, process in found} == {os.getpid()}) == (jobs == 1)
+def test_answers_come_from_as_many_processes(jobs: int) -> None:
+    found = [result_of(answer) for answer in asked(square, 6, jobs)]
+    assert [value for value, _ in found] == [0, 1, 4, 9, 16, 25]
+    processes = {process for _, process in found}
+    assert len(processes) == jobs
+    assert (processes == {os.getpid()}) == (jobs == 1)
 
 
-def test_an_error_is_raised_here() -> None:
-    def wrong() -> int:
-        raise ValueError("this one")
+def test_while_this_process_is_at_work_fewer_are_given_more() -> None:
+    with staff(square, 3) as workers:
+        assert workers.apart
+        for k in range(4):
+            workers.begin(k, k, hands=1)
+        found: list[tuple[int, Answer]] = []
+        while len(found) < 4:
+            found += workers.finished()
+    assert [key for key, _ in found] == [0, 1, 2, 3]
+    assert len({result_of(answer)[1] for _, answer in found}) == 1
 
-    with pytest.raises(ValueError, match="this one"):
-        side_by_side([wrong, lambda: 1], 2)
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_is_raised_here(jobs: int) -> None:
+    with pytest.raises(ZeroDivisionError):
+        [result_of(answer) for answer in asked(lambda k: 1 // k, 2, jobs)]
 
 
 def test_a_process_that_dies_is_named() -> None:
     with pytest.raises(EngineError, match="at work on a part was ended"):
-        side_by_side([lambda: os._exit(3), lambda: 1], 2)
+        [result_of(answer) for answer in asked(lambda k: os._exit(3), 3, 2)]
 
 
 def test_the_end_of_the_time_ends_them_all() -> None:
     watch = Watch(0.2)
     began = time.monotonic()
     with pytest.raises(OutOfTime), watch.running():
-        side_by_side([lambda: time.sleep(60), lambda: time.sleep(60)], 2)
+        asked(sleep, 2, 2)
     assert time.monotonic() - began < 30
+
+
+def test_what_is_to_interrupt_a_search_does_not_interrupt_its_copies() -> None:
+    def work(k: int) -> bool:
+        time.sleep(0.05)
+        poll()  # where the search's alarm would be heard
+        return bool(interrupted)
+
+    interrupted: list[int] = []
+    watch = Watch()
+    with watch.running(), watch.after(0.01, lambda: interrupted.append(1)):
+        found = asked(work, 2, 2)
+    assert [result_of(answer) for answer in found] == [False, False]
+    assert interrupted
 
 
 def test_a_timer_is_heard_after_the_fork_in_both_processes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,11 +109,12 @@ def test_a_timer_is_heard_after_the_fork_in_both_processes(monkeypatch: pytest.M
 
     monkeypatch.setattr(multiprocessing.context.ForkProcess, "start", interrupted)
     with pytest.raises(OutOfTime), Watch(30.0).running():
-        side_by_side([lambda: time.sleep(60)] * 2, 2)
+        asked(sleep, 2, 2)
     assert len(seen) == 1
     assert not seen[0].is_alive()
     monkeypatch.undo()
-    assert side_by_side([lambda: signal.pthread_sigmask(signal.SIG_BLOCK, [])] * 2, 2) == [set(), set()]
+    found = asked(lambda _: signal.pthread_sigmask(signal.SIG_BLOCK, []), 2, 2)
+    assert [result_of(answer) for answer in found] == [set(), set()]
 
 
 def test_a_verdict_has_one_thread_of_linear_algebra_and_gives_the_others_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,19 +163,19 @@ def test_an_executor_that_was_shut_down_is_named() -> None:
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
     with pytest.raises(SolverError, match="takes no more tasks"):
-        side_by_side([lambda: 1, lambda: 2], 1, pool)
+        asked(square, 2, 1, pool)
 
 
 def test_an_executor_that_breaks_down_has_lost_a_part() -> None:
     with ProcessPoolExecutor(1) as pool, pytest.raises(LostError, match="the worker of a part was lost"):
-        side_by_side([partial(os._exit, 3), partial(os._exit, 3)], 1, pool)
+        [result_of(answer) for answer in asked(os._exit, 2, 1, pool)]
 
 
 def test_nobody_works_on_for_a_process_that_was_killed(tmp_path: Path) -> None:
     script = (
-        "import os, sys, time\nfrom certbound.parallel import side_by_side\n"
+        "import os, sys, time\nfrom certbound.parallel import staff\n"
         "def work():\n    os.write(1, b'%d ' % os.getpid())\n    time.sleep(600)\n"
-        "side_by_side([work, work], 2)"
+        "with staff(work, 2) as workers:\n    workers.begin(1)\n    workers.begin(2)\n    time.sleep(600)"
     )
     process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

@@ -11,9 +11,9 @@ import numpy as np
 from certbound.problem.held import HeldLoop
 from certbound.problem.problem import Problem
 from certbound.reach.linear import shares
-from certbound.reach.linear.bisection import bisected
+from certbound.reach.linear.bisection import Bisection
 from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
-from certbound.reach.linear.hopes import best_of, coarser, hopes_of, least, nobody, refined, run_of, tried
+from certbound.reach.linear.hopes import best_of, coarser, hopes_of, least, nobody, nobody_waits, refined, run_of, tried
 from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
@@ -25,7 +25,7 @@ _PARTS = (2, 4, 8)  # cells along each side, tried one after the other
 _MOST_PIECES = 4000  # pieces of time times cells
 _FEW = 3  # states up to which cells of the start are looked at without being asked thoroughly
 _AT_ONCE = 3  # states from which on that is at once: with fewer, polynomials and metrics are quick, and may say more
-_EARLY = 0.2  # of the time that is left, for them
+_EARLY = 0.35  # of the time that is left, for them
 
 
 def refusal(problem: Problem) -> str | None:
@@ -60,20 +60,20 @@ def linear_answer(
     if first is not None and first.outcome.log_probability <= target.log:
         return first
     run = run_of(problem, cells=1 if cells is None else cells) if before is None else before.run
-    best, effort = best_of(run, target, found) if before is None else (before.outcome, shares.HOPED[-1][1])
-    unproved = best.log_probability > target.log
     plain = isinstance(problem, Problem) and not isinstance(run, DiffusionRun)
-    alone = cells is None and unproved
-    if alone and run.curved and plain:
-        assert isinstance(problem, Problem)
-        early = not quick and run.engine.n <= _FEW and (before is not None or run.engine.n >= _AT_ONCE)
-        if not run.parted and (thorough or early):
+    early = not quick and run.engine.n <= _FEW and (before is not None or run.engine.n >= _AT_ONCE)
+    halved = cells is None and run.curved and plain and not run.parted and (thorough or early)
+    with Bisection.of(run, target) if halved else nullcontext() as parts:
+        begin = nobody_waits if parts is None else parts.begin
+        best, effort = best_of(run, target, found, begin) if before is None else (before.outcome, shares.HOPED[-1][1])
+        alone = cells is None and best.log_probability > target.log
+        if parts is not None and alone:
             with nullcontext() if thorough else share_of_time(_EARLY):
-                split = bisected(problem, run, target)
+                split = parts.proved()
                 if split is not None:
                     return split
                 run.parted = True
-    elif thorough and alone and best.bounds is None:
+    if thorough and alone and best.bounds is None and not (run.curved and plain):
         run, (best, effort) = _on_grids(problem, run, target, found) or (run, (best, effort))
     if thorough and best.log_probability > _NOTHING and run.curved:
         for likelier in (share for share in map(Share.of, shares.LIKELIER) if target.log < share.log):

@@ -8,26 +8,27 @@ Where even its middle alone, as a start, is out of reach, no halving helps.
 
 from __future__ import annotations
 
-import heapq
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.parallel import side_by_side
+from certbound.parallel import Staff, result_of, staff
 from certbound.problem.problem import Problem
 from certbound.reach.linear.hopes import meeting, promising, refined, run_of
+from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.proved import LinearAnswer, SplitAnswer
-from certbound.reach.linear.run import LinearRun
-from certbound.reach.linear.shares import Share
+from certbound.reach.linear.run import LinearRun, Outcome
+from certbound.reach.linear.shares import GUESSED, Share
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.rigor.intervals import Interval
 from certbound.watch import executor_lent, jobs_allowed, poll
 
 _DEPTH = 4  # halvings of every side
-_BATCH = 4  # cells that are proved side by side, should there be processes for it
 _LOOK = 3  # halvings between two looks at the middle of a cell
 _MOST_PIECES = 16_000  # pieces of time times cells that are looked at
 _SPARE = 4_000  # cells times steps times squared states that may be spent on less than the target
@@ -50,10 +51,10 @@ class _Leaf:
         return Cells(centres=centre[None], boxes=Interval(self.low[None], self.high[None]))
 
     @property
-    def middle(self) -> Cells:
+    def middle(self) -> _Leaf:
         """Its middle alone."""
-        centre = self.cells.centres
-        return Cells(centres=centre, boxes=Interval.point(centre))
+        centre = self.cells.centres[0]
+        return _Leaf(centre, centre)
 
     def halves(self, side: int) -> tuple[_Leaf, _Leaf]:
         """Both halves along a side."""
@@ -63,92 +64,181 @@ class _Leaf:
         return _Leaf(self.low, below, (*self.path, (side, False))), _Leaf(above, self.high, (*self.path, (side, True)))
 
 
-_Proof = tuple[_Leaf, LinearAnswer]
+@dataclass(frozen=True, eq=False, slots=True)
+class _Hint:
+    """What a cell takes over from the one that was halved: the share that promised most, and what a proof needed."""
+
+    hoped: Share | None = None
+    learnt: tuple[Array, Array] | None = None
 
 
-def bisected(problem: Problem, whole: LinearRun, target: Share) -> SplitAnswer | None:
-    """The proof cell by cell that every start meets the target; None where it is out of reach, or takes too many cells.
+@dataclass(eq=False)
+class _Seen:
+    """What became of a cell; ``run`` stays in the process that looked at it."""
 
-    ``whole`` is the run over the initial set as one cell, which did not meet it.
-    """
-    pieces = whole.engine.pieces if whole.engine.continuous else None
-    boxes = initial_cells(problem).boxes
-    root = _Leaf(np.array(boxes.lo[0]), np.array(boxes.hi[0]))
-    wide = int(np.count_nonzero(root.low < root.high))
-    if not wide or not _middle_promises(problem, root, pieces, target):
-        return None
-    heap: list[tuple[float, int, _Leaf, LinearRun]] = [(0.0, 0, root, whole)]
-    done: list[_Proof] = []
-    count = 1
-    while heap:
-        poll(f"cells of the initial set: {len(done)} done, {len(heap)} to do")
-        worst = [heapq.heappop(heap) for _ in range(min(_BATCH, len(heap)))]
-        for _, _, _, run in worst:
-            run.learnt = done[-1][1].run.learnt if done else whole.learnt
-            run.hoped = done[-1][1].shown.nonlinear if done else run.hoped
-        found = _side_by_side([run for _, _, _, run in worst if run is not whole], target)
-        for _, _, leaf, run in worst:
-            proved = found.get(run)
-            if proved is not None:
-                done.append((leaf, proved))
-                continue
-            if len(leaf.path) >= _DEPTH * wide or (count + 2) * whole.engine.pieces > _MOST_PIECES:
-                return None
-            if leaf.path and len(leaf.path) % _LOOK == 0 and not _middle_promises(problem, leaf, pieces, target):
-                return None
-            for half in leaf.halves(_side(run)):
-                count += 1
-                other = run_of(problem, cells=half.cells, pieces=pieces)
-                other.hoped = run.hoped
-                heapq.heappush(heap, (-_urgency(other), count, half, other))
-    if not whole.engine.continuous:  # elsewhere events are dear
-        work = whole.engine.pieces * whole.engine.n**2
-        done = _further(problem, done, pieces, target, min(_SPARE // work - count, _MORE * count))
-    done.sort(key=lambda item: item[0].path)
-    return SplitAnswer.of([(leaf.path, leaf.low, leaf.high, answer) for leaf, answer in done])
+    run: LinearRun | None
+    fit: Array | None
+    hint: _Hint
+    promising: bool
+    found: tuple[Outcome, Outcome] | None = None  # the least outcome, and the one that is shown
+    known: dict[str, Any] = field(default_factory=dict)  # what the answer is asked for in any case
+    side: int = 0  # to halve, and how urgently
+    urgency: float = 0.0
+    hopeless: bool = False  # even its middle alone
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"run": None}
+
+    @property
+    def level(self) -> float:
+        """Logarithm of what is proved."""
+        return 0.0 if self.found is None else self.found[0].log_probability
+
+    def answer(self, problem: Problem, leaf: _Leaf, pieces: int | None) -> LinearAnswer:
+        """The proof, with its run."""
+        assert self.found is not None
+        run = self.run
+        if run is None:
+            plain = Linearisation(problem, cells=leaf.cells, pieces=pieces)
+            run = LinearRun(plain if self.fit is None else plain.corrected(self.fit))
+        return LinearAnswer(run=run, outcome=self.found[0], shown=self.found[1]).knowing(self.known)
 
 
-def _further(
-    problem: Problem, done: list[_Proof], pieces: int | None, target: Share, spare: int
-) -> list[_Proof]:
-    """The cells with the worst ones halved, while ``spare`` cells may be looked at and that gives less than before."""
-    while spare >= 2:
-        leaf, answer = worst = max(done, key=lambda item: item[1].outcome.log_probability)
-        level = answer.outcome.log_probability
-        if level <= _ENOUGH * target.log:
-            break
-        poll(f"cells of the initial set: {len(done)} done, halving the worst")
-        halves = [(half, run_of(problem, cells=half.cells, pieces=pieces)) for half in leaf.halves(_side(answer.run))]
-        proofs = _side_by_side([run for _, run in halves], target)
-        found = [(half, proofs[run]) for half, run in halves]
-        better = [(half, part) for half, part in found if part is not None and part.outcome.log_probability < level]
-        if len(better) < 2:
-            break
-        done = [item for item in done if item is not worst] + better
-        spare -= 2
-    return done
+_Proof = tuple[_Leaf, _Seen]
 
 
-def _side_by_side(runs: list[LinearRun], target: Share) -> dict[LinearRun, LinearAnswer | None]:
-    """What is proved of cells; each begins with what the proof of another one has learnt."""
-
-    answers: dict[LinearRun, LinearAnswer | None] = {}
-    tasks = [partial(_work, run, target) for run in runs]
-    for run, (found, learnt, hoped) in zip(runs, side_by_side(tasks, jobs_allowed(), executor_lent())):
-        run.learnt, run.hoped = learnt, hoped
-        answers[run] = None if found is None else LinearAnswer(run=run, outcome=found[0], shown=found[1])
-    return answers
-
-
-def _work(run: LinearRun, target: Share) -> Any:
-    """What is proved of a cell, without the run: outcome and what is shown, if it meets the target; what was learnt."""
-    met = meeting(run, target)
+def _look(problem: Problem, pieces: int | None, target: Share, leaf: _Leaf, hint: _Hint, proving: bool) -> _Seen:
+    """Whether a cell promises to meet the target, and the proof that it does if that is asked for."""
+    run = run_of(problem, cells=leaf.cells, pieces=pieces)
+    run.hoped, run.learnt = hint.hoped, hint.learnt
+    met = meeting(run, target) if proving else None
+    promise = met is not None if proving else promising(run, target)
     found = None if met is None else (refined(run, *met, target), met[0])
-    return found, run.learnt, run.hoped
+    seen = _Seen(
+        run=run, fit=run.engine.correction, hint=_Hint(run.hoped, run.learnt), promising=promise, found=found,
+    )  # fmt: skip
+    if found is not None:
+        seen.known = LinearAnswer(run=run, outcome=found[0], shown=found[1]).shown_values()
+    if leaf.path:
+        seen.side, seen.urgency = _side(run), _urgency(run)
+    if leaf.path and not promise and len(leaf.path) % _LOOK == 0:
+        seen.hopeless = not _look(problem, pieces, target, leaf.middle, _Hint(), False).promising
+    return seen
 
 
-def _middle_promises(problem: Problem, leaf: _Leaf, pieces: int | None, target: Share) -> bool:
-    return promising(run_of(problem, cells=leaf.middle, pieces=pieces), target)
+class Bisection:
+    """The proof cell by cell that every start meets the target, begun while the whole is still looked at.
+
+    ``whole`` is the run over the initial set as one cell. Where others can work meanwhile they look at its middle, and
+    from `begin` on, just before its first proof, at its halves; after the last proof `proved` does the rest. A cell
+    takes over what those that it is a part of found out, so that the answer is the same whoever comes first.
+    """
+
+    def __init__(self, whole: LinearRun, target: Share) -> None:
+        self.problem, self.whole, self.target = whole.engine.problem, whole, target
+        self.pieces = whole.engine.pieces if whole.engine.continuous else None
+        boxes = initial_cells(self.problem).boxes
+        self.root = _Leaf(np.array(boxes.lo[0]), np.array(boxes.hi[0]))
+        self.middle = self.root.middle
+        self.wide = int(np.count_nonzero(self.root.low < self.root.high))
+        self.open: dict[_Leaf, tuple[float, _Hint]] = {self.middle: (np.inf, _Hint())} if self.wide else {}
+        self.done: list[_Proof] = []
+        self.count = 1
+        self.workers: Staff
+        self.flying: dict[_Leaf, bool]
+
+    @classmethod
+    @contextlib.contextmanager
+    def of(cls, whole: LinearRun, target: Share) -> Iterator[Bisection]:
+        """With as many processes as are allowed; what time ended goes on where it was."""
+        found: Bisection = whole.halving or cls(whole, target)
+        whole.halving = found
+        asked = partial(_look, found.problem, found.pieces, target)
+        with staff(asked, jobs_allowed(), executor_lent()) as found.workers:
+            found.flying = {}
+            if found.workers.apart and found.middle in found.open:
+                found._ask(found.middle)
+            yield found
+
+    def begin(self, *, look: bool = True) -> None:
+        """Let others, if there are any, look at the halves."""
+        if self.wide and self.count == 1:
+            halves = self.root.halves(_side(self.whole))
+            self.open |= dict.fromkeys(halves, (0.0, _Hint(self.whole.hoped)))
+            self.count += len(halves)
+            for leaf in halves if look and self.workers.apart else ():
+                self._ask(leaf, hands=self.workers.width - 1)
+
+    def proved(self) -> SplitAnswer | None:
+        """All cells; None where the target is out of reach, or takes too many of them."""
+        self.begin(look=False)
+        if not self.wide:
+            return None
+        while self.open:
+            poll(f"cells of the initial set: {len(self.done)} done, {len(self.open)} to do")
+            while len(self.flying) < min(self.workers.width, len(self.open)):
+                waiting = (leaf for leaf in self.open if leaf not in self.flying)
+                self._ask(most := max(waiting, key=lambda leaf: self.open[leaf][0]), proving=most is not self.middle)
+            for leaf, seen, looked in self._finished():
+                if looked and leaf is not self.middle and (seen.promising or self._lost):
+                    continue
+                del self.open[leaf]
+                if seen.found is not None:
+                    self.done.append((leaf, seen))
+                elif leaf is not self.middle:
+                    if seen.hopeless or len(leaf.path) >= _DEPTH * self.wide:
+                        return None
+                    self.open |= dict.fromkeys(leaf.halves(seen.side), (seen.urgency, seen.hint))
+                    self.count += 2
+                elif not seen.promising:
+                    return None
+            if self.count * self.whole.engine.pieces > _MOST_PIECES:
+                return None
+        done = self.done
+        if not self.whole.engine.continuous:  # elsewhere events are dear
+            work = self.whole.engine.pieces * self.whole.engine.n**2
+            done = self._further(done, min(_SPARE // work - self.count, _MORE * self.count))
+        done = sorted(done, key=lambda item: item[0].path)
+        return SplitAnswer.of([
+            (leaf.path, leaf.low, leaf.high, seen.answer(self.problem, leaf, self.pieces)) for leaf, seen in done
+        ])
+
+    def _further(self, done: list[_Proof], spare: int) -> list[_Proof]:
+        """The cells with the worst ones halved, while ``spare`` cells may be looked at and that gives less."""
+        while spare >= 2:
+            leaf, seen = worst = max(done, key=lambda item: item[1].level)
+            if seen.level <= _ENOUGH * self.target.log:
+                break
+            poll(f"cells of the initial set: {len(done)} done, halving the worst")
+            for half in leaf.halves(seen.side):
+                self._ask(half, proving=True)
+            halves: list[_Proof] = []
+            while self.flying:
+                poll()
+                halves += [(half, seen) for half, seen, _ in self._finished()]
+            if max(half.level for _, half in halves) >= seen.level:
+                break
+            done = [item for item in done if item is not worst] + halves
+            spare -= 2
+        return done
+
+    @property
+    def _lost(self) -> bool:
+        """Whether the whole's remainder could not be enclosed: its halves begin with the share that asks for least."""
+        return bool(np.isfinite(self.whole.lost))
+
+    def _ask(self, leaf: _Leaf, proving: bool = False, hands: int | None = None) -> None:
+        hint = self.open[leaf][1] if leaf in self.open else _Hint()
+        if proving and leaf in self.open:
+            hoped = self.target.part(GUESSED[-1][0]) if self._lost and len(leaf.path) == 1 else hint.hoped
+            hint = _Hint(hoped, self.whole.learnt if hint.learnt is None else hint.learnt)
+        self.flying[leaf] = proving
+        self.workers.begin(leaf, leaf, hint, proving, hands=hands)
+
+    def _finished(self) -> Iterator[tuple[_Leaf, _Seen, bool]]:
+        """Cells, what became of them, and whether they were looked at only."""
+        for leaf, answer in self.workers.finished():
+            yield leaf, result_of(answer), not self.flying.pop(leaf)
 
 
 def _shares(run: LinearRun) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -31,23 +32,48 @@ _WIDER = 0.05  # of the remainder's share in a polytope
 class Inclusion:
     """Supports of y and R for all cells of a linearisation, and the bounds of beta that they prove.
 
-    ``outer`` holds rows of every cell, (N, n) each (N + 1 in discrete time), that R is bounded along beside the inner
-    ones. ``learnt`` is what the last proof needed beyond the sampled range of beta, (B, N, n) each: where it is given,
-    the first guess is made with it.
+    ``learnt`` is what the last proof needed beyond the sampled range of beta, (B, N, n) each: where it is given, the
+    first guess is made with it.
     """
 
-    def __init__(self, engine: Linearisation, outer: Sequence[Sequence[Array]] | None = None) -> None:
+    def __init__(self, engine: Linearisation) -> None:
         self.engine = engine
-        self.rows, self.extra = inner_rows(engine)
-        self.inner = self.rows.shape[2]
-        self.supports: list[Supports] = []
-        for cell, inner in enumerate(self.rows):
-            if not engine.continuous:
-                inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
-            further = () if outer is None else (rows[:, None] for rows in outer[cell])
-            self.supports.append(engine.supports(cell, np.concatenate([inner, *further], axis=1), engine.moved))
         self.failed_at = 0
         self.learnt: tuple[Array, Array] | None = None
+
+    @cached_property
+    def _rows(self) -> tuple[Array, Array]:
+        return inner_rows(self.engine)
+
+    @property
+    def rows(self) -> Array:
+        """The inner rows."""
+        return self._rows[0]
+
+    @property
+    def extra(self) -> Array:
+        """Those beside the active coordinates, over these alone."""
+        return self._rows[1]
+
+    @property
+    def inner(self) -> int:
+        """How many inner rows there are on a piece."""
+        return int(self.rows.shape[2])
+
+    def outer(self, cell: int) -> Sequence[Array]:
+        """Rows of a cell that R is bounded along beside the inner ones: (N, n) each, (N + 1, n) in discrete time."""
+        return ()
+
+    @cached_property
+    def supports(self) -> list[Supports]:
+        """The supports of every cell."""
+        found = []
+        for cell, inner in enumerate(self.rows):
+            if not self.engine.continuous:
+                inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
+            rows = np.concatenate([inner, *(rows[:, None] for rows in self.outer(cell))], axis=1)
+            found.append(self.engine.supports(cell, rows, self.engine.moved))
+        return found
 
     @property
     def nothing(self) -> tuple[Array, Array]:

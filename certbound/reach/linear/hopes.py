@@ -43,6 +43,10 @@ def nobody(answer: LinearAnswer) -> None:
     """Takes answers that nobody waits for."""
 
 
+def nobody_waits() -> None:
+    """Is called where nobody has anything to begin with."""
+
+
 def run_of(
     problem: Problem | HeldLoop, *, cells: int | Cells | None, noise: bool = True, pieces: int | None = None
 ) -> LinearRun:
@@ -60,22 +64,28 @@ def run_of(
 
 
 def best_of(
-    run: LinearRun, target: Share, found: Callable[[LinearAnswer], object] = nobody
+    run: LinearRun, target: Share, found: Callable[[LinearAnswer], object] = nobody,
+    begin: Callable[[], object] = nobody_waits,
 ) -> tuple[Outcome, int]:
     """The least probability over a few shares of the target for delta_N, and the last effort.
 
     Where a guess of the remainder tells which of them has a chance, only those are proved, and the last one if none.
+    ``begin`` is called before each proof.
     """
     guessed = run.curved and not isinstance(run, DiffusionRun)
     parts = shares.GUESSED if guessed else shares.HOPED if run.curved else shares.HOPED_LINEAR
     best: Outcome | None = None
     for hope in hopes_of(run, target) if guessed else parts:
+        begin()
         outcome = tried(run, target, hope)
         best = outcome if best is None else least(best, outcome)
         found(LinearAnswer(run=run, outcome=best, shown=best))
         if best.log_probability <= target.log or not (run.curved or run.engine.continuous):
             return best, hope[1]
-    return best or tried(run, target, parts[-1]), parts[-1][1]
+    if best is None:
+        begin()
+        best = tried(run, target, parts[-1])
+    return best, parts[-1][1]
 
 
 def meeting(run: LinearRun, target: Share) -> tuple[Outcome, int] | None:
@@ -101,27 +111,31 @@ def hopes_of(run: LinearRun, target: Share) -> Iterator[tuple[float, int]]:
     enclosed, only the last share is tried after it.
     """
     taken, found = 0.0, np.inf  # of the target: by the noise next to the least remainder, and in all
+    first, last = run.hoped, shares.GUESSED[-1]
+    looked: dict[tuple[float, int], float] = {}
 
-    def promise(share: float, effort: int, limit: float) -> float:
+    def promise(hope: tuple[float, int], spare: float = 0.0) -> float:
+        """Of the target; beyond ``spare`` more than it, no more than that is said."""
         nonlocal found
-        value = float(np.exp(min(run.promise(target.part(share), effort, limit=limit) - target.log, _MOST)))
-        if value < found:
-            found, run.hoped = value, target.part(share)
-        return value
+        if hope not in looked:
+            share, limit = target.part(hope[0]), target.log + float(np.log1p(spare))
+            looked[hope] = value = float(np.exp(min(run.promise(share, hope[1], limit=limit) - target.log, _MOST)))
+            if value < found:
+                found, run.hoped = value, share
+        return looked[hope]
 
-    first, (last, most) = run.hoped, shares.GUESSED[-1]
     in_order = sorted(shares.GUESSED, key=lambda hope: first is None or target.part(hope[0]) != first)
-    for index, (share, effort) in enumerate(in_order):
-        if share + _SURELY * taken > 1:
+    for index, hope in enumerate(in_order):
+        if hope[0] + _SURELY * taken > 1:
             continue
-        if promise(share, effort, target.log) <= 1:
-            yield share, effort
-            if run.lost >= target.part(share).log:  # the last one has the best chance then, and is the end of it
-                if share < last and promise(last, most, target.log) <= 1:
-                    yield last, most
+        if promise(hope, hope[0] if hope == last else 0.0) <= 1:
+            yield hope
+            if run.lost >= target.part(hope[0]).log:  # the last one has the best chance then, and is the end of it
+                if hope[0] < last[0] and promise(last) <= 1:
+                    yield last
                 return
         elif index == 0:
-            taken = promise(last, most, target.log + float(np.log1p(last))) - last
+            taken = promise(last, last[0]) - last[0]
 
 
 def promising(run: LinearRun, target: Share) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -119,6 +120,15 @@ class LinearAnswer:
         """Deviation tube at the problem's delta (None when nothing was proved)."""
         bounds = self.shown.bounds
         return None if bounds is None else answer_tubes.deviation_tube(self.run, self.shown, bounds)
+
+    def shown_values(self) -> dict[str, Any]:
+        """What verdicts show of an answer, by name, for `knowing`."""
+        return {name: getattr(self, name) for name in ("_tightest", "tube", "noise_free_reach")}
+
+    def knowing(self, values: dict[str, Any]) -> LinearAnswer:
+        """The same answer with values that were computed where it was proved."""
+        vars(self).update(values)
+        return self
 
     def extent_along(self, direction: ArrayLike) -> Array:
         """Bounds of |a . (X_t - x_t)| over every piece for one direction a alone: shape (K,).

@@ -9,6 +9,7 @@ to Z is a scalar event, so that P(unsafe) <= delta_N + sum_j P_j (Thm K7').
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,19 +57,29 @@ class LinearRun(Inclusion):
     """One evaluation of the engine: the inclusion for the remainder, the events, and their room.
 
     ``hoped`` is the delta_N that promised most, here or in a run much like this one, and ``lost`` the logarithm of the
-    largest one at which the remainder could not be enclosed; ``parted``: cells of the starts were tried in vain.
+    largest one at which the remainder could not be enclosed; ``parted``: cells of the starts were tried in vain;
+    ``halving``: what is proved of them so far.
     """
 
     def __init__(self, engine: Linearisation) -> None:
-        self.requirements = [requirements(engine.problem, engine.nominal(cell)) for cell in range(engine.cells)]
-        super().__init__(engine, [[asked.rows for asked in cell] for cell in self.requirements])
+        super().__init__(engine)
         self.hoped: Share | None = None
         self.lost = -np.inf
         self.parted = False
+        self.halving: Any = None
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[Share, tuple[Array, list[Events]]] = {}
         self.spent: dict[Share, tuple[Array, Array] | None] = {}
+
+    @cached_property
+    def requirements(self) -> list[list[Requirement]]:
+        """What the constraints ask for, cell by cell."""
+        return [requirements(self.engine.problem, self.engine.nominal(cell)) for cell in range(self.engine.cells)]
+
+    def outer(self, cell: int) -> list[Array]:
+        """The rows of what is asked."""
+        return [asked.rows for asked in self.requirements[cell]]
 
     def events(self, cell: int, shared: Share) -> Events:
         """Scalar events of one cell; ``shared`` is what they may cost in common."""

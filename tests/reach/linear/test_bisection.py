@@ -79,7 +79,7 @@ def test_in_few_states_cells_come_when_it_is_asked_again_but_not_in_haste(monkey
     def in_vain(*_: object) -> None:
         asked.append(1)
 
-    monkeypatch.setattr("certbound.reach.linear.answer.bisected", in_vain)
+    monkeypatch.setattr(bisection.Bisection, "proved", in_vain)
     first = linear_answer(problem, thorough=False)
     linear_answer(problem, thorough=False, quick=True, before=first)
     assert not asked
