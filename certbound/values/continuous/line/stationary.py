@@ -308,7 +308,7 @@ def _summed(coefficients: list[Fraction], y: Array) -> tuple[Array, Array]:
 
 
 def _derivative(coefficients: list[Fraction]) -> list[Fraction]:
-    """The Chebyshev coefficients of the derivative, exactly: c'_(k-1) = c'_(k+1) + 2 k c_k, and c'_0 is half of that."""
+    """The Chebyshev coefficients of the derivative, exactly: c'_(k-1) = c'_(k+1) + 2 k c_k, c'_0 half of it."""
     found = [Fraction(0)] * (len(coefficients) + 1)
     for k in range(len(coefficients) - 1, 0, -1):
         found[k - 1] = found[k + 1] + 2 * k * coefficients[k]
