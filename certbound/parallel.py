@@ -11,13 +11,14 @@ import contextlib
 import importlib
 import multiprocessing
 import os
+import sys
 import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from concurrent.futures import wait as first_of
-from functools import partial
+from functools import lru_cache, partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
@@ -110,13 +111,19 @@ def alone() -> Iterator[None]:
 
     Our matrices are small: threads that wait for each other take twice the processor time, and a busy machine's time.
     """
-    from threadpoolctl import threadpool_limits
-
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         importlib.import_module("scipy.linalg")  # has a library of its own, and only what is loaded is held back
 
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _libraries(len(sys.modules)).limit(limits=1, user_api="blas"):
         yield
+
+
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> Any:
+    """Those of linear algebra, which are looked for (for some milliseconds) only where modules were loaded since."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def _answer(task: Callable[[], Any]) -> Answer:

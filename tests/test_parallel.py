@@ -138,11 +138,11 @@ def test_a_verdict_has_one_thread_of_linear_algebra_and_gives_the_others_back(mo
 @pytest.fixture(scope="module")
 def one() -> cb.Verdict:
     """From one process: the initial set is split."""
-    return cb.verify_safety(flattening(), method="linear", jobs=1)
+    return cb.verify_safety(flattening(0.7), method="linear", jobs=1)
 
 
 def test_two_jobs_give_the_same_answer_bit_for_bit(one: cb.Verdict) -> None:
-    two = cb.verify_safety(flattening(), method="linear", jobs=2)
+    two = cb.verify_safety(flattening(0.7), method="linear", jobs=2)
     assert one.status == "SAFE"
     assert one.log10_delta == two.log10_delta
     assert one.deviation is not None
@@ -152,7 +152,7 @@ def test_two_jobs_give_the_same_answer_bit_for_bit(one: cb.Verdict) -> None:
 
 def test_an_executor_gives_the_same_answer_bit_for_bit(one: cb.Verdict) -> None:
     with ThreadPoolExecutor(2) as pool:
-        two = cb.verify_safety(flattening(), method="linear", executor=pool)
+        two = cb.verify_safety(flattening(0.7), method="linear", executor=pool)
     assert one.log10_delta == two.log10_delta
     assert one.deviation is not None
     assert two.deviation is not None

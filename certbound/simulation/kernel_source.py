@@ -141,7 +141,7 @@ def step_lines(model: StepModel, p: Parameters) -> tuple[list[str], Bridge | Non
         finite = _sum("odd", [f"(y_{i} - y_{i})" for i in range(model.dimension)])
     lines = [
         f"t = k * {p.add(model.interval)}",
-        *_inputs(model),
+        *_inputs(model, p),
         *_disturbance(model, p),
         _drift_call(model, "x", "f", p),
         *noise_lines,
@@ -162,14 +162,14 @@ def _sum(name: str, terms: Sequence[str]) -> list[str]:
     return [f"{name} = {lines[0]}", *[f"{name} += {line}" for line in lines[1:]]]
 
 
-def _inputs(model: StepModel) -> list[str]:
+def _inputs(model: StepModel, p: Parameters) -> list[str]:
     """Lines that set the inputs: those that are held keep what they were at the last sampling time."""
     held = model.held_count
     lines = [f"u_{held + i} = inputs[k, {i}]" for i in range(model.input_count - held)]
     if model.law is None:
         return lines
     call = f"{_targets(vector('u', held))} = law(p, t, {', '.join(vector('x', model.dimension))})"
-    return [*lines, f"if k % {model.every} == 0:", f"    {call}"]
+    return [*lines, f"if k % int({p.add(model.every)}) == 0:", f"    {call}"]
 
 
 def nominal_lines(model: StepModel, p: Parameters) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,17 @@ def course(start: Any = Diamond([0.3, -0.2], 0.05), **options: Any) -> cb.Proble
     return cb.Problem(system, **({"initial": start, "safe": safe, "horizon": 4, "delta": 0.1} | options))
 
 
+@cache
+def counted() -> cb.ExitCounts:
+    """Paths of the course that leave."""
+    return cb.simulate_exits(course(), paths=20_000, rng=np.random.default_rng(0))
+
+
+@cache
+def proved(method: str) -> cb.Verdict:
+    return cb.verify_safety(course(), method=method)
+
+
 def as_polytopes(problem: cb.Problem) -> cb.Problem:
     """The same problem with the package's own shapes, where nothing moves."""
     safe = [type(c)(cb.Polytope(*around_origin(c.region)), during=c.during) for c in problem.safe]
@@ -83,18 +94,15 @@ def test_it_contains_what_it_says_and_samples_it() -> None:
 
 @pytest.mark.parametrize("method", ["auto", "constants", "linear"])
 def test_what_is_certified_lies_above_the_simulation(method: str) -> None:
-    problem = course()
-    verdict = cb.verify_safety(problem, method=method)
+    verdict = proved(method)
     (answer,) = [a for a in verdict.answers.values() if a.log10_delta == verdict.log10_delta]
     assert answer.applicable, answer.reason
     assert 1e-4 < 10**verdict.log10_delta < 0.9
-    assert cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0)).lower <= 10**verdict.log10_delta
+    assert counted().lower <= 10**verdict.log10_delta
 
 
 def test_value_functions_bound_it_from_both_sides() -> None:
-    problem = course()
-    found = bound_failure(problem, seconds=0.5)
-    counts = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0))
+    found, counts = bound_failure(course(), seconds=0.5), counted()
     assert 1e-4 < found.upper < 0.9
     assert counts.lower <= found.upper
     assert 0 < found.lower <= counts.upper
@@ -108,7 +116,7 @@ def test_it_is_proved_in_continuous_time_too(monkeypatch: pytest.MonkeyPatch) ->
         flow, initial=Diamond([0.1, 0.0], 0.05), safe=safe, horizon=0.5, delta=0.2,
         domain=cb.Box([-1.1, -1.1], [1.1, 1.1]),  # for the barrier, which asks for a box
     )  # fmt: skip
-    low = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0)).lower
+    low = cb.simulate_exits(problem, paths=10_000, steps=200, rng=np.random.default_rng(0)).lower
     for method in ("constants", "linear", "barrier"):
         verdict = cb.verify_safety(problem, method=method)
         assert low <= 10**verdict.log10_delta < 1, method
@@ -152,11 +160,10 @@ def test_a_file_states_its_faces(tmp_path: Any) -> None:
 @pytest.mark.parametrize("method", ["constants", "linear"])
 def test_its_certificate_is_accepted_and_a_forged_one_is_not(method: str) -> None:
     problem = course()
-    verdict = cb.verify_safety(problem, method=method)
-    text = certificate_text(problem, verdict)
+    text = certificate_text(problem, proved(method))
     report = check_data(parse(text), json.loads(json.dumps(problem_data(problem))))
     assert report.valid, report.reason
-    assert cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0)).lower <= 10**report.log10_proved
+    assert counted().lower <= 10**report.log10_proved
     for number, change in ((0, -0.3), (1, 0.2)):  # a smaller safe set, a larger obstacle
         forged = parse(text)
         region = forged["problem"]["constraints"][number]["region"]

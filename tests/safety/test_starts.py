@@ -77,7 +77,7 @@ def test_from_every_safe_start_simulation_fails_no_more_often_than_delta(make: M
     worst = np.argsort(found.bound(inner))[-1:]
     for point in [*inner[worst], low[0], high[-1]]:  # the rim, where the bound is all but used up
         assert found.contains(point)
-        counts = cb.simulate_exits(problem.replace(initial=point), paths=20_000, rng=rng, confidence=0.998)
+        counts = cb.simulate_exits(problem.replace(initial=point), paths=10_000, rng=rng, confidence=0.998)
         assert counts.lower <= 10.0 ** float(found.bound(point)[0]) <= problem.delta * (1 + 1e-12)
         if found.charts.lower and problem.system.disturbance is None:  # it bounds the worst disturbance
             assert counts.upper >= 10.0 ** float(found.charts.lower[0].at(point[None], up=False)[0])

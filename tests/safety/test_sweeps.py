@@ -156,7 +156,7 @@ def test_a_killed_run_goes_on_with_the_same_table(tmp_path: Path) -> None:
     assert 2 <= kept < 6
     found = cb.sweep("ou", over, method="linear", jobs=2, resume=file)
     assert len(found.points) == 6
-    assert untimed(found) == untimed(cb.sweep("ou", over, method="linear", jobs=2))
+    assert untimed(found) == untimed(cb.sweep("ou", over, method="linear", jobs=1))
 
 
 def test_a_lost_process_is_replaced(whole: cb.Sweep) -> None:

@@ -73,7 +73,7 @@ def test_a_share_of_genes_is_bounded_the_same_seen_from_either_end() -> None:
 
 def test_nobody_leaves_where_no_face_can_be_crossed() -> None:
     logistic = line(lambda x: [x[0] * (1 - x[0])], lambda t, x: [[x[0] * (1 - x[0])]], ([0.0], [1.0]))
-    assert bound_exits(logistic, seconds=0.2).upper < -100
+    assert bound_exits(logistic, seconds=0.01).upper < -100
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def ou(n=1, start=None, horizon=5.0):
 
 @pytest.mark.parametrize("scheme", ["exact", "euler"])
 def test_quantiles_are_the_exact_ones_in_one_dimension(scheme):
-    found = sup_deviation(ou(), paths=50_000, rng=1, steps=250, scenario=Scenario(scheme=scheme))
+    found = sup_deviation(ou(), paths=25_000, rng=1, steps=250, scenario=Scenario(scheme=scheme))
     for delta in (0.1, 0.01, 0.001):
         value, lower, upper = found.quantile(1 - delta, confidence=0.9999)
         exact = exit_radius(delta, **OU)

@@ -62,7 +62,7 @@ def test_one_step_back_is_above_the_mean_of_any_function_however_wrong(ready) ->
     )
     drift, h = compile_numpy(voyage.tape), voyage.horizon / COARSE.count
     live = np.argwhere(layout.level == 0)
-    for cell in live[rng.choice(len(live), 12, replace=False)]:
+    for cell in live[rng.choice(len(live), 8, replace=False)]:
         y = np.array([axis[k] + rng.uniform(0.1, 0.9) * (axis[k + 1] - axis[k]) for axis, k in zip(layout.axes, cell)])
         x = y.copy()
         for _ in range(40):  # half a step back

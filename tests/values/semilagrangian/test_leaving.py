@@ -33,9 +33,9 @@ def mechanical(force, s: float, low, high, horizon: float, start) -> cb.Problem:
 
 
 def simulated(problem: cb.Problem, paths: int, rng: np.random.Generator) -> tuple[float, float]:
-    """Share of the paths that leave, seen at 800 times only, and its standard error."""
+    """Share of the paths that leave, seen at 400 times only, and its standard error."""
     setting = setting_of(problem)
-    drift, parts = compile_numpy(setting.tape), 800
+    drift, parts = compile_numpy(setting.tape), 400
     d = setting.horizon / parts
     p, q = (np.full(paths, ends[0]) for ends in setting.starts)
     inside = np.ones(paths, dtype=bool)

@@ -5,7 +5,7 @@ on [low, high]. Where m >= 0 at the ends and L m <= -(1 - e) < 0 for every distu
 minimum inside, as L m >= 0 there. Where m <= 0 at the ends and L m >= -(1 + e), E tau >= m/(1 + e).
 
 m is a polynomial that nearly solves L m = -1 (collocation), its coefficients are numbers from there on, and L m is
-enclosed over small cells: m' and m'' at their middles in balls, elsewhere by a bound of the next derivative
+enclosed over small cells: m' and m'' at their middles with what is rounded, elsewhere by a bound of the next derivative
 (|T_k^(j)| is largest at 1).
 
 **The rate.** Where v <= 0 at the ends and L v >= -k v for every disturbance, e^{kt} v(X) is a submartingale until the
@@ -28,6 +28,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
+from certbound.rigor import rounding
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import enclose, squared_diffusion
@@ -263,27 +264,55 @@ class _Cells:
 
     def moved(self, coefficients: Array) -> Interval:
         """Ranges of L m over the cells, for every disturbance."""
-        first = _polynomial(coefficients).derivative()
+        first = _derivative([Fraction(value) for value in coefficients.tolist()])
         slope = self._over(first, _largest(coefficients, 3)) / self.half
-        bend = self._over(first.derivative(), _largest(coefficients, 4)) / (self.half * self.half)
+        bend = self._over(_derivative(first), _largest(coefficients, 4)) / (self.half * self.half)
         return self.f * slope + self.a * bend * Interval.point(0.5)
 
     def values(self, coefficients: Array) -> Interval:
         """Ranges of m itself."""
-        return self._over(_polynomial(coefficients), _largest(coefficients, 2))
+        return self._over([Fraction(value) for value in coefficients.tolist()], _largest(coefficients, 2))
 
-    def _over(self, function: fmpq_poly, bend: float) -> Interval:
+    def _over(self, coefficients: list[Fraction], bend: float) -> Interval:
         """Ranges over the cells, from values and slopes at their middles and a bound of the second derivative."""
-        own, slope = arb_poly(function), arb_poly(function.derivative())
-        with precision():
-            half = arb(1) / self.count
-            room = arb(bend) * half * half / 2
-            low, high = [], []
-            for middle in self.middles.tolist():
-                value, reach = own(arb(middle)), half * abs(slope(arb(middle))) + room
-                low.append(lower(value - reach))
-                high.append(upper(value + reach))
-        return Interval(np.array(low), np.array(high))
+        value, error = _summed(coefficients, self.middles)
+        slope, more = _summed(_derivative(coefficients), self.middles)
+        half = 1.0 / self.count  # a power of 2: nothing is rounded where it multiplies
+        with np.errstate(all="ignore"):
+            room = rounding.upper(
+                error + half * (np.abs(slope) + more + half / 2 * bend), step=4 * rounding.STEP, tiny=rounding.TINY
+            )
+            low, high = rounding.lower(value - room), rounding.upper(value + room)
+            known = np.isfinite(value) & np.isfinite(room)
+        return Interval(np.where(known, low, -np.inf), np.where(known, high, np.inf))
+
+
+def _summed(coefficients: list[Fraction], y: Array) -> tuple[Array, Array]:
+    """sum c_k T_k at places in [-1, 1] by Clenshaw's recurrence, and a bound of its error.
+
+    b_k = 2 y b_(k+1) - b_(k+2) + c_k is linear: what is computed is the exact sum for coefficients c_k + e_k, where e_k
+    is what is rounded in the line of b_k (or what c_k is off as a float), and |T_k(y)| <= 1. Twice the unit that three
+    operations are rounded by covers the rounding of the errors' own sum.
+    """
+    floats = [float(value) for value in coefficients]
+    off = sum((abs(value - Fraction(number)) for value, number in zip(coefficients, floats)), Fraction(0))
+    now, before, rounded = np.zeros_like(y), np.zeros_like(y), np.zeros_like(y)
+    with np.errstate(all="ignore"):
+        for k in range(len(floats) - 1, -1, -1):
+            product = (2 * y if k else y) * now
+            difference = product - before
+            before, now = now, difference + floats[k]
+            rounded += np.abs(product) + np.abs(difference) + np.abs(now)
+        tiny = len(floats) * rounding.TINY + np.nextafter(float(off), np.inf)
+        return now, rounding.upper(rounding.STEP * rounded + tiny, tiny=rounding.TINY)
+
+
+def _derivative(coefficients: list[Fraction]) -> list[Fraction]:
+    """The Chebyshev coefficients of the derivative, exactly: c'_(k-1) = c'_(k+1) + 2 k c_k, c'_0 half of it."""
+    found = [Fraction(0)] * (len(coefficients) + 1)
+    for k in range(len(coefficients) - 1, 0, -1):
+        found[k - 1] = found[k + 1] + 2 * k * coefficients[k]
+    return [found[0] / 2, *found[1 : max(len(coefficients) - 1, 1)]]
 
 
 def _polynomial(coefficients: Array) -> fmpq_poly:
