@@ -178,9 +178,9 @@ def _members(model: Model, proof: object, path: str) -> Iterator[tuple[Model, ob
 def _is_whole(model: Model, proof: object) -> bool:
     """Whether a proof is of a target and of an infinite horizon, where there are any."""
     engine = proof.get("engine") if isinstance(proof, Mapping) else None
-    if model.stays or engine == "values":
+    if model.stays:
         return engine == "values" and not model.continuous
-    return engine in WHOLE
+    return engine == "values" or engine in WHOLE
 
 
 def _cells(

@@ -96,7 +96,10 @@ class Crossing(Passage):
         n, highest = self.model.dimension, -np.inf
         which = terms(1 + n, 3 + 5 * n)
         for first, last in self._chunks(self.surface):
-            _, high = self.surface.patches(first, last).derivative(which, (0,) * (n + 1)).sharp_ends()
+            patches = self.surface.patches(first, last)
+            if self.due is not None:
+                patches = patches.take(np.flatnonzero(np.tile(self.due.ravel(), last - first)))
+            _, high = patches.derivative(which, (0,) * (n + 1)).sharp_ends()
             highest = max(highest, _most(high))
         if not highest < np.inf:
             raise Unproved("V was not shown to be bounded")
@@ -111,13 +114,7 @@ class Crossing(Passage):
 
     def _on(self, axis: int, end: int) -> float:
         """At least V on a side of the grid."""
-        n, face = self.model.dimension, self.surface.face(axis, end)
-        which = terms(n, 3 + 5 * (n - 1))
-        found = [
-            _most(face.patches(first, last).derivative(which, (0,) * n).sharp_ends()[1])
-            for first, last in self._chunks(face)
-        ]
-        return float(np.nextafter(max(found) + self.lift, np.inf))
+        return float(np.nextafter(self.across(axis, -end)[1].max() + self.lift, np.inf))
 
     def _variables(self) -> int:
         """The disturbance takes fixed values."""

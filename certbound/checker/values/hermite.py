@@ -76,9 +76,9 @@ class Surface:
         return Patches(np.stack([a.ravel() for a in low]), np.stack([a.ravel() for a in high]), flat)
 
 
-    def face(self, axis: int, side: int) -> Surface:
-        """V on one side of the grid (0: lower, 1: upper), as a function of time and of the other states."""
-        cut = (slice(None),) * (1 + 2 * axis) + (-side, 0)
+    def across(self, axis: int, node: int) -> Surface:
+        """V where a state is at one of its nodes, as a function of time and of the other states."""
+        cut = (slice(None),) * (1 + 2 * axis) + (node, 0)
         values, rates = self.values[cut], self.rates[cut]
         return Surface(self.times, tuple(row for k, row in enumerate(self.axes) if k != axis), values, rates)
 

@@ -36,7 +36,7 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, SafeSet
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
-from certbound.checker.values.batches import Array, Batch, Index, Terms, above, below, terms
+from certbound.checker.values.batches import Array, Batch, Index, Mask, Terms, above, below, terms
 from certbound.checker.values.hermite import Patches, Surface
 from certbound.checker.values.step_back import independent
 from certbound.errors import CertificateError
@@ -51,6 +51,8 @@ _DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
 """Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""
 _ENTRIES = 4_000_000
 _CHUNK = 4096
+_HIGHEST = -0.05
+"""Of the logarithm of what counts where paths end that have not left: any number below 0 would do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +108,7 @@ class Passage:
         self.random = model.initial.covariance is not None
         names = ["engine", "axes", "times", "values", "rates", "edges", "m", "q", "lam", "eps"]
         names += ["pieces"] if self.random else []
-        names += [] if self.upper_side else ["side"] if self.random else ["side", "starts"]
-        record = self.record = Record(value, "proof", names)
+        record = self.record = Record(value, "proof", [*names, *self._named()])
         self.model, self.budget, n = model, budget, model.dimension
         if n not in _DEGREES:
             raise Unproved(f"value functions are proved for at most {max(_DEGREES)} states")
@@ -127,6 +128,15 @@ class Passage:
             raise CertificateError(f"`proof.pieces` must cut the cells into at most {MOST_PARTS} parts.")
         self.degrees = _DEGREES[n]
         self.lift = 0.0
+        self.due: Mask | None = None
+
+    def _named(self) -> list[str]:
+        """What else the file states."""
+        return [] if self.upper_side else ["side"] if self.random else ["side", "starts"]
+
+    def _last(self) -> float:
+        """When it is over."""
+        return self.model.horizon
 
     def _read(self, record: Record) -> Surface:
         n = self.model.dimension
@@ -135,7 +145,7 @@ class Passage:
         for name, row in [("times", times), *(("axes", axis) for axis in axes)]:
             if len(row) < 2 or not (np.diff(row) > 0).all():
                 raise CertificateError(f"`proof.{name}` must be two or more numbers that rise.")
-        if times[0] != 0 or times[-1] != self.model.horizon:
+        if times[0] != 0 or times[-1] != self._last():
             raise Unproved("the slabs of time do not cover the horizon")
         if (len(times) - 1) * np.prod([len(axis) - 1 for axis in axes]) > MOST_PATCHES:
             raise CertificateError(f"`proof.axes` and `proof.times` must make at most {MOST_PATCHES} patches.")
@@ -164,7 +174,7 @@ class Passage:
         else:
             found = (later + v0 + self.levels.above(v0)).exp()
         found += (v0 + most).exp() * total
-        floor = arb.min(arb(self._at_end()), arb(-1)).exp()
+        floor = arb.min(arb(self._at_end()), arb(_HIGHEST)).exp()
         return arb.min((found - floor) / (1 - floor), arb(1)).upper()
 
     def _check_box(self) -> None:
@@ -181,13 +191,17 @@ class Passage:
 
     def _missing(self) -> float:
         """What V lacks of 0 on the sides of the box: V plus that has the same residual."""
-        least, n = 0.0, self.model.dimension
-        for axis, side in itertools.product(range(n), (0, 1)):
-            face = self.surface.face(axis, side)
-            for first, last in self._chunks(face):
-                low, _ = face.patches(first, last).derivative(terms(n, 3 + 5 * (n - 1)), (0,) * n).sharp_ends()
-                least = min(least, float(np.where(np.isnan(low), -np.inf, low).min()))
-        return -least
+        sides = itertools.product(range(self.model.dimension), (0, 1))
+        return -min(0.0, *(float(self.across(axis, -side)[0].min()) for axis, side in sides))
+
+    def across(self, axis: int, node: int) -> tuple[Array, Array]:
+        """Ends of V, before it is lifted, where a state is at a node: over all patches, time slowest."""
+        n, face = self.model.dimension, self.surface.across(axis, node)
+        which, found = terms(n, 3 + 5 * (n - 1)), []
+        for first, last in self._chunks(face):
+            found.append(face.patches(first, last).derivative(which, (0,) * n).sharp_ends())
+        low, high = (np.concatenate(parts) for parts in zip(*found))
+        return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
 
     def _at_start(self) -> float:
         """At least V(0, .) on the initial set."""
@@ -275,6 +289,9 @@ class Passage:
         for first, last in self._chunks(self.surface):
             patches = self.surface.patches(first, last)
             slab = first + np.arange(patches.low.shape[1]) // per
+            if self.due is not None:  # nothing is asked where paths are over
+                here = np.flatnonzero(np.tile(self.due.ravel(), last - first))
+                patches, slab = patches.take(here), slab[here]
             for degree in self.degrees:
                 need = self._needs(patches, slab, start, degree)
                 settled = (need <= self.stated[slab]) | (degree == self.degrees[-1])

@@ -15,6 +15,7 @@ from certbound.checker.statement import Model, StepSet, cells_of, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Array, above, terms
 from certbound.checker.values.crossing import Crossing
+from certbound.checker.values.entering import bound_failing_above, bound_failing_below
 from certbound.checker.values.normal_means import axis_table, mean_table
 from certbound.checker.values.passage import Passage
 from certbound.checker.values.piece_means import PieceTransition, pieces_of
@@ -49,6 +50,8 @@ _LOST = 1e-3  # of the largest probability of being safe: cells with less count 
 def check_values(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken."""
     with np.errstate(all="ignore"):  # what is no number is unknown
+        if model.continuous and model.target is not None:
+            return bound_failing_above(model, value, budget)
         if model.continuous:
             return Passage(model, value, budget).upper()
         return _Discrete(model, value, budget, upper=True).bound()
@@ -59,6 +62,8 @@ def check_values_below(model: Model, value: object, budget: Budget) -> arb:
     if model.initial.around:
         raise Unproved("the initial set is stated by a box around it, of which lower bounds say nothing")
     with np.errstate(all="ignore"):
+        if model.continuous and model.target is not None:
+            return bound_failing_below(model, value, budget)
         if model.continuous:
             return Crossing(model, value, budget).lower()
         return _Discrete(model, value, budget, upper=False).bound()

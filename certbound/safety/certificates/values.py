@@ -96,8 +96,6 @@ def _exits_of(problem: Problem, answer: EngineAnswer) -> ExitBounds:
     """What was found in continuous time."""
     if not isinstance(answer.details, ExitBounds):
         raise CertificateError("certificates do not state rates of leaving.")
-    if problem.reach is not None:
-        raise CertificateError("certificates state that a target is met at one time, and this engine counts all times.")
     if problem.endless:
         raise CertificateError("certificates state no bounds of infinite horizons that rest on grids.")
     return answer.details
@@ -146,6 +144,8 @@ def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]
             "not come, go or jump, in two states bounded boxes whose faces paths cross, no obstacles and no oblique or "
             "curved limits."
         )
+    if problem.reach is not None:
+        return _entered(problem, *found.proposed[-1], lower=False)
     best = min(payment.log for _, payment in found.proposed)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
     surface, payment = next(pair for pair in found.proposed if pair[1].log <= best + share)
@@ -156,6 +156,8 @@ def _crossing(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any
     """The same for the lower bound: the sides of the grid must lie beyond those of the safe set."""
     if not found.proposed_below:
         raise CertificateError("no value function was found that the checker knows, from below.")
+    if problem.reach is not None:
+        return _entered(problem, *found.proposed_below[-1], lower=True)
     best = max(payment.log for _, payment in found.proposed_below)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
     surface, payment = next(pair for pair in found.proposed_below if pair[1].log >= best - share)
@@ -164,6 +166,25 @@ def _crossing(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any
     if not problem.initial.random:
         data["starts"] = exact(some_starts(problem))
     return data
+
+
+def _entered(problem: Problem, surface: Surface, payment: Payment, *, lower: bool) -> dict[str, Any]:
+    """A value function of a target. From below the grid keeps off the target, or has small cells around it."""
+    assert problem.reach is not None
+    surface = surface.raised(payment.lift)
+    if lower:
+        around, axes = problem.reach.region.hull(), [_spread(axis) for axis in surface.axes]
+        places = problem.reach.region.places(problem.system.dimension)
+        for place, *ends in zip(places, around.lo.tolist(), around.hi.tolist()):
+            step = INWARD * (axes[place][-1] - axes[place][0])
+            for end, sign in zip(ends, (-1, 1)):
+                if problem.system.dimension == 1 and np.min(np.abs(axes[0][[0, -1]] - end)) <= 3 * step:
+                    axes[0] = np.where(np.abs(axes[0] - end) <= 3 * step, end + sign * step, axes[0])
+                else:
+                    axes[place] = axes[place] + sign * step * (surface.axes[place] == end)
+        surface = replace(surface, axes=tuple(axes))
+    data = _stated(problem, surface, payment)
+    return data | ({"side": "lower", "starts": exact(some_starts(problem))} if lower else {})
 
 
 def _stated(problem: Problem, surface: Surface, payment: Payment) -> dict[str, Any]:

@@ -113,11 +113,11 @@ def bound_exits(
         from certbound.values.continuous.plane import bound_failing
 
         _refuse_random(problem)
-        upper, least, words = bound_failing(problem, model, target, begin + seconds)
+        upper, least, words, (proposed, below) = bound_failing(problem, model, target, begin + seconds)
     elif target is not None:
         from certbound.values.continuous.line import bound_arrival
 
-        most, rest, words = bound_arrival(problem, model, target)
+        most, rest, words, (proposed, below) = bound_arrival(problem, model, target)
         upper, least = most, None if rest == -math.inf else rest
     elif problem.system.dimension == 1:
         from certbound.values.continuous.line import bound_line

@@ -25,18 +25,24 @@ from certbound.values.continuous.line.initial_law import Start, start_of
 from certbound.values.continuous.line.linked import Link, prove_below, spans
 from certbound.values.continuous.line.phases import Phase, limits_of
 from certbound.values.continuous.line.reach import cuts_of
-from certbound.values.continuous.payment import pay_upper
+from certbound.values.continuous.payment import Payment, pay_upper
+from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
+
+Proposed = tuple[Surface, Payment]
 
 _RUNGS = 3
 _FLOOR = math.log(0.3)
 """V at the limit and at the horizon: with w = e^V there, V is log(w + (1 - w) P), and w is subtracted at last."""
 
 
-def bound_arrival(problem: Problem, model: Model, target: Region) -> tuple[float, float, str]:
+def bound_arrival(
+    problem: Problem, model: Model, target: Region
+) -> tuple[float, float, str, tuple[list[Proposed], list[Proposed]]]:
     """Natural logarithms of an upper and a lower bound of P(failing) from the worst start (0, -inf: none), and words.
 
-    ``problem`` has no target; the arrival has to be within its horizon.
+    ``problem`` has no target; the arrival has to be within its horizon. What certificates state comes last: V of
+    P(arriving), from below for the upper bound and from above for the lower one.
 
     Raises
     ------
@@ -58,10 +64,10 @@ def bound_arrival(problem: Problem, model: Model, target: Region) -> tuple[float
     late = _between(outer, (small.low, wide.high) if side == 1 else (wide.low, small.high), side, model, start)
     early = _between(outer, (wide.low, small.high) if side == 1 else (small.low, wide.high), side, model, start)
     limited = wide.closed[1 - side]  # a path that passes a mere cut may come back and arrive
-    least, most, done = _bounds(early if limited else None, late, (start, spread), side)
+    least, most, done, proposed = _bounds(early if limited else None, late, (start, spread), side)
     found = ", ".join(done) or "none came to an end"
     words = f"value function in one state for arriving, cells x slabs of time: {found}"
-    return complement(least, up=True), complement(most, up=False), words
+    return complement(least, up=True), complement(most, up=False), words, proposed
 
 
 def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start, Start]:
@@ -96,9 +102,10 @@ def _between(
 
 def _bounds(
     early: ladder.Room | None, late: ladder.Room, starts: tuple[Start, Start], side: int
-) -> tuple[float, float, list[str]]:
+) -> tuple[float, float, list[str], tuple[list[Proposed], list[Proposed]]]:
     """Natural logarithms of bounds of P(arriving): at least (first start), at most (some of the others)."""
     start, spread = starts
+    proposed: tuple[list[Proposed], list[Proposed]] = ([], [])
     rough = ladder.sketches(late)
     least, most, done = -math.inf, 0.0, list[str]()
     for fineness, tolerance, lead in ladder.LADDER[:_RUNGS]:
@@ -106,33 +113,37 @@ def _bounds(
         try:
             links = early and ladder.surface_of_arrival(early, side, rough, (share, fineness, tolerance, lead), _FLOOR)
             if links and spans(links, upper=True):
-                most = min(most, _prove_above(links[0], spread, side))
+                surface, above = _prove_above(links[0], spread, side)
+                proposed[1].extend([(surface, above)] if above.log < most else [])
+                most = min(most, above.log)
             links = ladder.surfaces_below(late, start, rough, (share, fineness, 0.5 * tolerance, lead), _FLOOR)
             if links is not None and spans(links, upper=False):
                 payment = prove_below(links, start)
                 done.append(f"{links[0].surface.cells[0]} x {links[0].surface.slabs}")
-                least = max(least, -math.inf if payment is None else payment.log)
+                if payment is not None and payment.log > least:
+                    least = payment.log
+                    proposed[0].append((links[0].surface, payment))
         except OutOfTime:
             if not done:
                 raise
             break
-    return least, most, done
+    return least, most, done, proposed
 
 
-def _prove_above(link: Link, start: Start, side: int) -> float:
+def _prove_above(link: Link, start: Start, side: int) -> Proposed:
     """An upper bound of log P(arriving), whatever the surface is: V >= 0 on the face, and w = exp(inf V) elsewhere."""
     surface = link.surface
     for _ in range(3):
         missing = -surface.face_range(0, side)[0]
         surface = surface.raised(up(missing)) if missing > 0 else surface
     if surface.face_range(0, side)[0] < 0:
-        return 0.0
+        return surface, Payment(log=0.0)
     level = up(start.highest(surface, link.phase))
     need = Need(spare=NEGLIGIBLE / (link.phase.end - link.phase.start), start=level, top=0.0)
     proof = examine(surface, link.model, need, upper=True)
     floor = min(float(surface.range_at(-1)[0].min()), surface.face_range(0, 1 - side)[0])
     parts = patched_of(proof, proof.ranges.residual_high, need, surface.steps)
-    return pay_upper(parts, level, floor - 1e-15 * (1 + abs(floor))).log
+    return surface, pay_upper(parts, level, floor - 1e-15 * (1 + abs(floor)))
 
 
 def complement(log: float, *, up: bool) -> float:

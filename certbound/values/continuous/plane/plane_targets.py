@@ -46,6 +46,8 @@ from certbound.values.continuous.surface import Surface
 from certbound.values.sets import contains
 from certbound.watch import OutOfTime
 
+Proposed = tuple[Surface, Payment]
+
 _FACTOR = 1.12
 _TOP = -0.02
 _CAP = 50.0
@@ -119,20 +121,25 @@ class _Aim:
 
 def prove_failing_above(surface: Surface, aim: _Aim) -> Payment:
     """An upper bound of log P(failing), whatever the surface is."""
+    return _proved_above(surface, aim)[1]
+
+
+def _proved_above(surface: Surface, aim: _Aim) -> Proposed:
+    """The same, and the surface, raised by what it misses."""
     fate = Fate.of(surface.axes, aim.target)
     if not fate.beside.any():
-        return Payment(log=0.0)
+        return surface, Payment(log=0.0)
     for _ in range(3):
         late = float(surface.range_at(-1)[0][fate.alive].min(initial=0.0))
         missing = -min(0.0, late, *_on_faces(surface, fate, _FACES)[0])
         surface = surface.raised(up(missing)) if missing > 0 else surface
     if missing > 0:
-        return Payment(log=0.0)
+        return surface, Payment(log=0.0)
     start = up(extreme_over(surface, aim.plane.starts, upper=True))
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, aim.model, need, upper=True, alive=fate.alive)
     payment, lift = cheapest(proof, need, surface, start, _over(surface, fate.beside)[0])
-    return replace(payment, lift=lift)
+    return surface, replace(payment, lift=lift)
 
 
 def prove_failing_below(surface: Surface, aim: _Aim) -> Payment | None:
@@ -226,10 +233,10 @@ def _promising(aim: _Aim, plan: Plan) -> Surface | None:
 
 def bound_failing(
     problem: Problem, model: Model, target: Region, deadline: float
-) -> tuple[float, float | None, str]:
+) -> tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]:
     """Natural logarithms of an upper and a lower bound of P(failing) (None: there is none), and words.
 
-    ``problem`` has no target; the arrival has to be within its horizon.
+    ``problem`` has no target; the arrival has to be within its horizon. What certificates state of both comes last.
 
     Raises
     ------
@@ -245,18 +252,23 @@ def bound_failing(
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     floor = _floor(aims[0])
     upper, lower, done = 0.0, -math.inf, list[str]()
+    above, below = list[Proposed](), list[Proposed]()
     for cells in sorted({_cells(aims[0].plane.horizon, share * patches) for share in _SHARES}):
         plan = _plan(aims[0].plane.horizon, floor, cells)
         with contextlib.suppress(OutOfTime):
             surface = _promising(aims[0], plan)
             if surface is not None:
-                upper = min(upper, prove_failing_above(surface, aims[0]).log)
+                found = _proved_above(surface, aims[0])
+                above += [found] if found[1].log < upper else []
+                upper = min(upper, found[1].log)
             surface = _promising(aims[1], plan)
             payment = None if surface is None else prove_failing_below(surface, aims[1])
-            lower = max(lower, -math.inf if payment is None else payment.log)
+            if surface is not None and payment is not None and payment.log > lower:
+                lower = payment.log
+                below.append((surface, payment))
         done.append(f"{plan.cells}^2")
     words = f"value function with a target in two states, cells: {', '.join(done)}"
-    return upper, None if lower == -math.inf else lower, words
+    return upper, None if lower == -math.inf else lower, words, (above, below)
 
 
 def _plan(horizon: float, floor: float, cells: int) -> Plan:
