@@ -140,12 +140,12 @@ def bound_exits(
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)
     else:
-        from certbound.values.continuous.plane import two_states
+        from certbound.values.continuous.straight import bound_plane
 
         _refuse_random(problem)
         room = safe_room(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
-        upper, least, words, (proposed, below) = two_states(problem, model, room, begin + seconds, wanted)
+        upper, least, words, (proposed, below) = bound_plane(problem, model, room, begin + seconds, wanted)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),

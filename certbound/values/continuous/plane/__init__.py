@@ -6,7 +6,7 @@ for windows, and ``frames`` for limits that move.
 """
 
 from certbound.values.continuous.plane.frames import bound_moving, moving
-from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times, spread_nodes
 from certbound.values.continuous.plane.plane_reach import Floats, reach_of
 from certbound.values.continuous.plane.plane_targets import bound_failing
 from certbound.values.continuous.plane.plane_windows import bound_windows
@@ -16,13 +16,14 @@ from certbound.values.continuous.plane.two_sides import (
     bound_plane_above,
     chart_plane,
     held_plane,
+    plane_of,
     released,
     rough_level,
     two_states,
 )
 
 __all__ = [
-    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
-    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "reach_of", "released", "rough_level",
+    "Floats", "Pair", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
+    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "plane_of", "reach_of", "released", "rough_level",
     "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
 ]
