@@ -24,7 +24,15 @@ from certbound.values.continuous.curved import bound_region, boxed, walled
 from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import Model
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane import bound_moving, bound_windows, confined, led, moving, windowed
+from certbound.values.continuous.plane import (
+    bound_moving,
+    bound_windows,
+    confined,
+    led,
+    moving,
+    two_states,
+    windowed,
+)  # fmt: skip
 from certbound.values.continuous.room import limits_of, safe_room
 from certbound.values.continuous.surface import Surface
 
@@ -140,12 +148,12 @@ def bound_exits(
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)
     else:
-        from certbound.values.continuous.plane import two_states
+        from certbound.values.continuous.straight import bound_plane
 
         _refuse_random(problem)
-        room = limits_of(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
-        upper, least, words, (proposed, below) = two_states(problem, model, room, begin + seconds, wanted)
+        way, room = (two_states, limits_of(problem)) if led(model) else (bound_plane, safe_room(problem))
+        upper, least, words, (proposed, below) = way(problem, model, room, begin + seconds, wanted)
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),

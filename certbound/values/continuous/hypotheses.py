@@ -151,19 +151,23 @@ def side_by_side(look: Callable[[tuple[int, int]], Found], chunks: list[tuple[in
         return list(pool.map(look, chunks))
 
 
-def sampled_residual(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array]:
+def sampled_residual(
+    surface: Surface, model: Model, *, upper: bool = True, along: int = 5
+) -> tuple[Array, Array]:
     """The largest R among a few samples of each patch in two states, and V's least value there: no bounds.
 
     For lower bounds the largest -R of the best branch, and V's largest value. Both have shape (slabs, *cells); a
-    sketch of what `examine` finds, at a tenth of its cost.
+    sketch of what `examine` finds, at a tenth of its cost with five samples ``along`` each state.
     """
-    excess, low, high = sampled(surface, model, upper=upper)
+    excess, low, high = sampled(surface, model, upper=upper, along=along)
     return excess, low if upper else high
 
 
-def sampled(surface: Surface, model: Model, *, upper: bool = True) -> tuple[Array, Array, Array]:
+def sampled(
+    surface: Surface, model: Model, *, upper: bool = True, along: int = 5
+) -> tuple[Array, Array, Array]:
     """The same in two or three states, with V's least and largest values."""
-    counts, sample = ((4, 5, 5), sample_in_plane) if len(surface.axes) == 2 else ((4, 7, 7, 7), sample_in_space)
+    counts, sample = ((4, along, along), sample_in_plane) if len(surface.axes) == 2 else ((4, 7, 7, 7), sample_in_space)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 
@@ -212,12 +216,20 @@ def prove_upper(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], held: Sequence[Sides] = ()
 ) -> Payment:
     """An upper bound of log P(leaving the box of the surface by its last time), whatever the surface is."""
+    return proved_upper(surface, model, starts, held)[0]
+
+
+def proved_upper(
+    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], held: Sequence[Sides] = (),
+    negligible: float = NEGLIGIBLE,
+) -> tuple[Payment, Proof]:
+    """The same with what was seen; ``negligible`` stands for `NEGLIGIBLE`."""
     surface = raised_above(surface, held)
     start = up(extreme_over(surface, starts, upper=True))
-    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
+    need = Need(spare=negligible / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, model, need, upper=True)
     payment, lift = cheapest(proof, need, surface, start)
-    return replace(payment, lift=lift)
+    return replace(payment, lift=lift), proof
 
 
 def cheapest(
@@ -284,11 +296,19 @@ def prove_lower(
     """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
     if extreme_over(surface, starts, upper=False, points=points) == -math.inf:
         return None
+    return proved_lower(surface, model, starts, points)[0]
+
+
+def proved_lower(
+    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
+    negligible: float = NEGLIGIBLE,
+) -> tuple[Payment | None, Proof]:
+    """The same with what was seen, where some start lies in the grid; ``negligible`` stands for `NEGLIGIBLE`."""
     surface = _sunk(surface)
     start = -up(-extreme_over(surface, starts, upper=False, points=points))
-    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
+    need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf)
     proof = examine(surface, model, need, upper=False)
-    return _earned(proof, need, surface, start)
+    return _earned(proof, need, surface, start), proof
 
 
 def _sunk(surface: Surface) -> Surface:

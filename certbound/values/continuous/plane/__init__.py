@@ -6,7 +6,7 @@ for windows, and ``frames`` for limits that move.
 """
 
 from certbound.values.continuous.plane.frames import bound_moving, moving
-from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, slab_times, spread_nodes
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times, spread_nodes
 from certbound.values.continuous.plane.plane_reach import Floats, floats_of, led, reach_of
 from certbound.values.continuous.plane.plane_targets import bound_failing
 from certbound.values.continuous.plane.plane_windows import bound_windows
@@ -17,13 +17,14 @@ from certbound.values.continuous.plane.two_sides import (
     chart_plane,
     confined,
     held_plane,
+    plane_of,
     released,
     rough_level,
     two_states,
 )
 
 __all__ = [
-    "Floats", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
-    "bound_windows", "chart_plane", "confined", "floats_of", "held_plane", "integrated", "led", "moving", "reach_of",
-    "released", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
+    "Floats", "Pair", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
+    "bound_windows", "chart_plane", "confined", "floats_of", "held_plane", "integrated", "led", "moving", "plane_of",
+    "reach_of", "released", "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
 ]

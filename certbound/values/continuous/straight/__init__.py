@@ -1,0 +1,9 @@
+"""Two states, failing not too rare: the probability U itself instead of its logarithm.
+
+``ramps`` proposes U, ``near_one`` corrects it by its own residual and proves V = e (U - 1) with a small e by
+`hypotheses`: exp(V) is e U and a constant, but for e^2, so that the theorem of V = log u becomes the linear one.
+"""
+
+from certbound.values.continuous.straight.near_one import bound_plane
+
+__all__ = ["bound_plane"]

@@ -1,0 +1,156 @@
+"""Both bounds by proposals of U itself, corrected by their own residual, and proved by `hypotheses`.
+
+Carried residual: what a sample of the residual asks for, times a factor, is the source of the next proposal (`Source`).
+The equation is linear, so that U grows by no more than the expected payment along paths, and the residual that is left
+shrinks by its factor from one pass to the next. The last one is bounded on every patch; the theorem pays for the rest.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.problem.problem import Problem
+from certbound.values.continuous.held_faces import check_noise
+from certbound.values.continuous.hypotheses import (
+    NEGLIGIBLE,
+    Model,
+    covers,
+    extreme_over,
+    proved_lower,
+    proved_upper,
+    raised_above,
+    sampled_residual,
+)  # fmt: skip
+from certbound.values.continuous.payment import Payment
+from certbound.values.continuous.plane import Plane, Source, held_plane, plane_of, rough_level, two_states
+from certbound.values.continuous.room import Room, points_of, starts_of
+from certbound.values.continuous.straight.ramps import SMALL, Ramps
+from certbound.values.continuous.surface import Surface
+from certbound.watch import OutOfTime
+
+Proposed = tuple[Surface, Payment]
+Found = tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]
+
+_RARE = math.log(1e-7)
+_CELLS = (24, 34, 48, 68)
+_COST = 0.012  # about the seconds of both sides, over cells^2
+_SHARE = 0.75  # of what may be spent
+_LEAD = 6.0  # over cells^2: a ramp's share of the horizon
+_FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
+_AGAIN = (3.0, 3.0)  # the same for bounds of it
+_LEFT = 0.01  # of the answer: a residual that need not be carried any more
+_CLOSE = 0.05  # of log P between both bounds: no finer grid
+_ENOUGH = 0.25  # and nothing else is tried
+
+
+def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wanted: float) -> Found:
+    """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
+    granted, starts = deadline - time.perf_counter(), starts_of(problem)
+    inner = plane_of(problem, model, room.inner_low, room.inner_high, starts)
+    if not inner.autonomous or len(model.branches) > 1 or held_plane(inner, model)[0] is not inner:
+        return two_states(problem, model, room, deadline, wanted)
+    check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
+    outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
+    if wanted < math.inf:
+        check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
+    if not _RARE < rough_level(inner) < 0:
+        return two_states(problem, model, room, deadline, wanted)
+    upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
+    above, below = list[Proposed](), list[Proposed]()
+    for cells in _CELLS:
+        cost = _COST * cells**2
+        if done and spent + cost > _SHARE * granted:
+            break
+        try:
+            found = _bounded(inner, model, cells, None, below=False)
+            done.append(f"{cells}^2")
+            if found is not None and found[1].log < upper:
+                above.append(found)
+                upper = found[1].log
+            spent += cost / 2
+            if upper <= wanted < math.inf:
+                break
+            if wanted < math.inf:
+                found = _bounded(outer, model, cells, points_of(problem), below=True)
+                spent += cost / 2
+                if found is not None and found[1].log > lower:
+                    below.append(found)
+                    lower = found[1].log
+        except OutOfTime:
+            if upper == 0:
+                raise
+            break
+        if upper - lower < _CLOSE or -math.inf < wanted < lower:
+            break
+    words = f"value function in two states, cells: {', '.join(done)}"
+    least = None if lower == -math.inf else lower
+    if upper <= wanted < math.inf or -math.inf < wanted < lower or upper - lower < _ENOUGH:
+        return upper, least, words, (above, below)
+    try:
+        log = two_states(problem, model, room, time.perf_counter() + granted - spent, wanted)
+    except OutOfTime:
+        return upper, least, words, (above, below)
+    least = max((one for one in (least, log[1]) if one is not None), default=None)
+    above += [one for one in log[3][0] if one[1].log < upper]
+    below += [one for one in log[3][1] if one[1].log > lower]
+    return min(upper, log[0]), least, f"{words} and {log[2].rpartition('cells: ')[2]}", (above, below)
+
+
+def _bounded(plane: Plane, model: Model, cells: int, points: Array | None, *, below: bool) -> Proposed | None:
+    """The best bound of a few proposals: corrected by samples of the residual, then by its bounds."""
+    solver, starts = Ramps(plane, cells, min(_LEAD / cells**2, 0.1) * plane.horizon), plane.starts
+    surface, source, value = _corrected(solver, model, points, below)
+    if surface is None or not 0 < value < 1:
+        return None
+    best: Proposed | None = None
+    for factor in (*_AGAIN, None):
+        spare = NEGLIGIBLE * SMALL * value
+        payment: Payment | None
+        if below:
+            payment, proof = proved_lower(surface, model, starts, points, spare)
+            needed = -proof.ranges.residual_low
+        else:
+            payment, proof = proved_upper(surface, model, starts, (), spare)
+            needed = np.where(proof.ranges.low < 0, proof.ranges.residual_high, 0.0)
+        if payment is not None and (best is None or (payment.log > best[1].log if below else payment.log < best[1].log)):
+            best = surface if below else raised_above(surface), payment
+        if factor is None or not np.isfinite(needed).all():
+            break
+        table = np.zeros((surface.slabs, surface.cells[0] * surface.cells[1]))
+        table[proof.slab, proof.cell] = np.maximum(needed, 0.0) / SMALL
+        table = table.reshape(surface.slabs, *surface.cells)
+        if table.max(axis=(1, 2)) @ surface.steps < _LEFT * value:
+            break
+        source = _more(source, surface, factor * table)
+        surface = solver.surface(source, below=below)
+    return best
+
+
+def _corrected(
+    solver: Ramps, model: Model, points: Array | None, below: bool
+) -> tuple[Surface | None, Source | None, float]:
+    """The last proposal, its source, and about its bound."""
+    plane, source, value = solver.plane, None, 0.0
+    for factor in (*_FACTORS, None):
+        surface = solver.surface(source, below=below)
+        if not covers(surface, plane.horizon, plane.low, plane.high, within=not below):
+            break
+        value = 1 + extreme_over(surface, plane.starts, upper=not below, points=points) / SMALL
+        excess, _ = sampled_residual(surface, model, upper=not below, along=6)
+        needed = np.maximum(excess, 0.0) / SMALL
+        paid = float(needed.max(axis=(1, 2)) @ surface.steps)
+        if not math.isfinite(paid) or value <= 0:
+            break
+        if factor is None or paid < 2 * _LEFT * value:
+            return surface, source, value
+        source = _more(source, surface, factor * needed)
+    return None, None, value
+
+
+def _more(source: Source | None, surface: Surface, needed: Array) -> Source:
+    more = Source.above(surface, needed)
+    return more if source is None else source.plus(more)

@@ -1,0 +1,172 @@
+"""Floating-point proposals of the probability U itself in two states; nothing here is certified.
+
+U_tau = f.grad U + tr(a U'') / 2 + s, tau = T - t, is linear: collocation with quintic splines along both axes, and steps
+of the Radau IIA method of three stages (order 5, L-stable; Hairer and Wanner, Solving Ordinary Differential Equations
+II, Sec. IV.5), whose three systems are one real and one complex one (Sec. IV.8). Steps double as tau grows.
+
+*Ramps.* U = 0 at T and 1 on the faces do not go together. So on a face U rises: 1 - U falls at a rate k(tau), and moves
+along the face like the process whose motion across the face is left out; in a corner both faces' rates add up. So
+1 - U in a corner is the product of what it is along both faces, and the equation holds there too. Where more is needed
+in a corner (noises that go together), the source does it, which acts on faces as it does inside.
+
+Lower bounds take U as it is. For upper bounds the ramp is over before T: U starts `SHIFT` ramps earlier, and is divided
+by its least value on the faces.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from scipy.sparse import csc_matrix, csr_matrix, diags, eye, kron, vstack
+from scipy.sparse.linalg import splu
+
+from certbound.arrays import Array
+from certbound.values.continuous.hypotheses import top_of
+from certbound.values.continuous.plane import Plan, Plane, Source, spread_nodes
+from certbound.values.continuous.proposal import Splines
+from certbound.values.continuous.surface import Surface
+from certbound.watch import poll
+
+SHIFT = 2.5
+SMALL = 2.0**-8
+"""e of V = e (U - 1)."""
+_RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a ramp
+_GROWTH = 0.5  # a step over tau, at most
+_FIRST = 0.2  # of a ramp, the first step
+_LONGEST = 8  # steps of the horizon, at least
+
+_R = 6**0.5
+_STAGES = np.array([(4 - _R) / 10, (4 + _R) / 10, 1.0])
+_INVERSE = np.linalg.inv([
+    [(88 - 7 * _R) / 360, (296 - 169 * _R) / 1800, (-2 + 3 * _R) / 225],
+    [(296 + 169 * _R) / 1800, (88 + 7 * _R) / 360, (-2 - 3 * _R) / 225],
+    [(16 - _R) / 36, (16 + _R) / 36, 1 / 9],
+])  # fmt: skip
+_ROOTS, _TO = np.linalg.eig(_INVERSE)
+_REAL = int(np.argmin(np.abs(_ROOTS.imag)))
+_PAIR = int(np.argmax(_ROOTS.imag))
+_FROM = np.linalg.inv(_TO)
+_END = np.vander([0.0, *_STAGES], 4, increasing=True)
+_END_RATE = np.array([0.0, 1.0, 2.0, 3.0]) @ np.linalg.inv(_END)
+
+
+class Ramps:
+    """The collocated equation on a grid; U is kept as the coefficients of its splines.
+
+    ``plane`` must not depend on time and have one branch.
+    """
+
+    def __init__(self, plane: Plane, cells: int, lead: float) -> None:
+        self.plane, self.lead = plane, lead
+        nodes = [spread_nodes(plane, Plan(cells=cells, growth=_GROWTH, lead=lead), axis) for axis in (0, 1)]
+        self.nodes, self.splines = nodes, [Splines(one) for one in nodes]
+        x, y = np.meshgrid(*(one.points for one in self.splines), indexing="ij")
+        (force,), a = plane.drift(0.0, x, y), plane.square(0.0, x, y) * np.ones((2, 2, *x.shape))
+        on = np.zeros((2, *x.shape))  # faces across the first and across the second axis
+        on[0, [0, -1]] = on[1, :, [0, -1]] = 1
+        own = [[csr_matrix(table) for table in one.dense] for one in self.splines]
+
+        def part(weight: Array, i: int, j: int) -> csr_matrix:
+            return diags(weight.ravel()) @ kron(own[0][i], own[1][j], format="csr")
+
+        self.mass = kron(own[0][0], own[1][0], format="csr")
+        self.operator = part((1 - on[0]) * force[0], 1, 0) + part((1 - on[1]) * force[1], 0, 1)
+        self.operator += part((1 - on[0]) * a[0, 0] / 2, 2, 0) + part((1 - on[1]) * a[1, 1] / 2, 0, 2)
+        self.operator += part((1 - on[0]) * (1 - on[1]) * a[0, 1], 1, 1)
+        self.count = on.sum(axis=0).ravel()
+        self.edge, self.inner = np.flatnonzero(self.count), np.flatnonzero(self.count == 0)
+        self.factors: dict[float, tuple[object, object]] = {}
+
+    def surface(self, source: Source | None, *, below: bool) -> Surface:
+        """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
+        horizon, shift = self.plane.horizon, 0.0 if below else SHIFT * self.lead
+        times, first = _times(horizon, shift, self.lead)
+        sign = -1.0 if below else 1.0
+        given = None if source is None else sign * source.at([one.points for one in self.splines])
+        value, rate = np.zeros(len(self.count)), np.zeros(len(self.count))
+        values, rates = [value], [rate]
+        for start, end in itertools.pairwise(times):
+            poll("a proposal of the value function")
+            step = end - start
+            stages = [shift + horizon - (start + c * step) for c in _STAGES]
+            fed = np.zeros((3, len(value)))
+            if source is not None and given is not None:
+                fed = np.stack([_at(source.times, given, t) for t in stages])
+            ages = start + _STAGES * step
+            found = self._step(value, step, fed, ages)
+            rate = _END_RATE @ np.vstack([value, found]) / step
+            value = found[2]
+            values.append(value)
+            rates.append(rate)
+        return self._written(times[first:] - times[first], values[first:], rates[first:], below)
+
+    def _step(self, value: Array, step: float, fed: Array, ages: Array) -> Array:
+        """U at the three stages: the faces first, which do not depend on what is inside."""
+        edge = self.edge
+        right = np.outer(_INVERSE.sum(axis=1) / step, self.mass @ value) + fed
+        x = ages / self.lead
+        fall = _RATE * x * x / (1 + x**3) / self.lead
+        own, moved = self.mass[edge][:, edge], self.operator[edge][:, edge]
+        decay = kron(diags(fall), diags(self.count[edge]) @ own)
+        system = kron(csr_matrix(_INVERSE / step), own) - kron(eye(3), moved) + decay
+        gained = right[:, edge] + np.outer(fall, self.count[edge])
+        right[:, edge] = splu(csc_matrix(system)).solve(gained.ravel()).reshape(3, -1)
+        if step not in self.factors:
+            self.factors[step] = self._factor(_ROOTS[_REAL].real / step), self._factor(_ROOTS[_PAIR] / step)
+        real, pair = self.factors[step]
+        turned = _FROM @ right
+        parts = np.outer(_TO[:, _REAL], real.solve(np.ascontiguousarray(turned[_REAL].real)))  # type: ignore[attr-defined]
+        parts = parts + 2 * np.outer(_TO[:, _PAIR], pair.solve(turned[_PAIR]))  # type: ignore[attr-defined]
+        return np.asarray(parts.real)
+
+    def _factor(self, root: complex) -> object:
+        whole = vstack([
+            (root * self.mass - self.operator)[self.inner], eye(len(self.count), format="csr")[self.edge]
+        ], format="csr")  # fmt: skip
+        order = np.argsort(np.concatenate([self.inner, self.edge]))
+        return splu(csc_matrix(whole[order]))
+
+    def _written(self, times: Array, values: list[Array], rates: list[Array], below: bool) -> Surface:
+        maps = [np.stack(one.at_nodes, axis=1) for one in self.splines]
+        shape = tuple(one.count for one in self.splines)
+        tables = np.array([values, rates]).reshape(2, -1, *shape)
+        first = np.einsum("iap,rkpq->rkiaq", maps[0], tables, optimize=True)
+        data = np.einsum("jbq,rkiaq->rkiajb", maps[1], first, optimize=True)[:, ::-1]
+        forward = self.plane.horizon - times[::-1]
+        forward[0], forward[-1] = 0.0, self.plane.horizon
+
+        def made(scale: float, shift: float) -> Surface:
+            found = Surface(
+                axes=tuple(self.nodes), times=forward, values=scale * data[0], start_rates=-scale * data[1, :-1],
+                end_rates=-scale * data[1, 1:],
+            )  # fmt: skip
+            return found.raised(shift)
+
+        whole = made(1.0, 0.0)
+        faces = [whole.face_range(axis, side) for axis in (0, 1) for side in (0, 1)]
+        if below:  # U may rise over 1 beside corners
+            return made(SMALL / max(1.0, top_of(whole)), -SMALL)
+        return made(SMALL / max(min(low for low, _ in faces), 0.5), -SMALL)
+
+
+def _at(times: Array, values: Array, t: float) -> Array:
+    """Linear between the times, and constant beyond them."""
+    t = min(max(t, times[0]), times[-1])
+    left = min(max(int(np.searchsorted(times, t)) - 1, 0), len(times) - 2)
+    share = (t - times[left]) / (times[left + 1] - times[left])
+    return np.asarray((1 - share) * values[left] + share * values[left + 1]).ravel()
+
+
+def _times(horizon: float, shift: float, lead: float) -> tuple[Array, int]:
+    """Ends of the steps, one of them at ``shift`` and the last one at shift + horizon, and the first one's number."""
+    step, steps = _FIRST * lead, [_FIRST * lead]
+    while sum(steps) < horizon + shift:
+        while 2 * step <= min(_GROWTH * (sum(steps) + 2 * _FIRST * lead), horizon / _LONGEST):
+            step *= 2
+        steps.append(step)
+    times = np.concatenate([[0.0], np.cumsum(steps)])
+    first = int(np.argmin(np.abs(times - shift))) if shift else 0
+    begun = times[: first + 1] * (shift / times[first] if shift else 1.0)
+    rest = (times[first:] - times[first]) * (horizon / (times[-1] - times[first]))
+    return np.concatenate([begun[:-1], shift + rest]), first
