@@ -68,6 +68,9 @@ def contained(engine: str) -> Iterator[None]:
         own = isinstance(error, CertboundError) or type(error) is ArithmeticError
         raise EngineError(str(error) if own else _failure(engine, error)) from error
     except Exception as error:  # all of them: one engine's defect must not hide what another one proved
+        cause = error.__cause__
+        if isinstance(error, SystemError) and cause is not None and not isinstance(cause, Exception):
+            raise cause from None  # a time limit, or the user, within compiled code
         _log.debug("the %s engine failed", engine, exc_info=True)
         raise EngineError(f"{_failure(engine, error)} This is a defect of certbound.") from error
 

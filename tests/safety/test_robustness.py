@@ -21,6 +21,7 @@ from certbound.reach.linear import linearisation
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
+from certbound.watch import OutOfTime
 
 
 def sine_map(unit: float = 1.0) -> cb.Problem:
@@ -299,3 +300,9 @@ def test_other_units_have_a_certificate_too(build: Callable[[float], cb.Problem]
     problem = build(unit)
     text = proved_certificate(problem, verdict_in(build, unit, method))
     assert float.fromhex(json.loads(text)["claim"]["log10_delta"]) < -3
+
+
+@pytest.mark.parametrize("kind", [OutOfTime, KeyboardInterrupt])
+def test_what_stops_compiled_code_is_no_failure_of_an_engine(kind: type[BaseException]) -> None:
+    with pytest.raises(kind), contained("values"):
+        raise SystemError("a compiled function returned a result with an exception set") from kind()
