@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -24,6 +25,7 @@ _TINY = 1e-300
 _TERMS = 24
 _MEMORY = 6 * 2**30  # bytes that the rows of one cell may take
 _KEPT = 2**29  # bytes of absolute values that are kept beside the coefficients
+_ROW, _ENTRIES = 4000, 2**22  # products in a sum, and entries of a matrix, up to which all steps are one matrix
 _MILD = 2.0  # norm of the slopes times a piece, up to which series run well in the states' own units
 _SWEEPS, _FARTHEST = 20, 60  # of balancing; exponent of a unit
 _LARGE, _SPARSE = 40, 0.1  # states and share of nonzero entries from which on products are sparse
@@ -311,7 +313,7 @@ class RowResponse:
                 self.rest[j] = np.abs(later[:, self.others]).sum(axis=1) * (1 + 1e-12)
             current[j + 1 :] = _times(later, self.transition[j]).reshape(-1, self.count, n)
         self.initial = current
-        few = sum(part.nbytes for part in self.coefficients) <= _KEPT
+        few = sum(part.nbytes for part in self.coefficients) <= _KEPT and self._whole is None
         self.magnitudes = [np.abs(part) for part in self.coefficients] if few else None
 
     def _gather(self, parts: Iterator[Array]) -> Array:
@@ -327,11 +329,29 @@ class RowResponse:
     def _sizes(self, bounds: Array) -> Array:
         """Sum over j of |coefficients| ``bounds``_j, (N, n) or (N, n, B): shape (M, D) or (M, D, B), not rounded."""
         few, own = bool(len(self.others)), bounds[:, self.columns]
+        if (whole := self._whole) is not None and np.isfinite(bounds).all():  # 0 times infinity is no number
+            steps = self.nodes - 1
+            row = [own[:steps], bounds[:steps, self.others].max(axis=1, keepdims=True)] if few else [own[:steps]]
+            flat = np.concatenate(row, axis=1).reshape(-1, *bounds.shape[2:])
+            return np.asarray((whole @ flat).reshape(self.nodes, self.count, *bounds.shape[2:])[:, self.place])
         sizes = map(np.abs, self.coefficients) if self.magnitudes is None else self.magnitudes
         return self._gather(
             size @ own[j] + (np.multiply.outer(self.rest[j], bounds[j, self.others].max(axis=0)) if few else 0.0)
             for j, size in enumerate(sizes)
         )
+
+    @cached_property
+    def _whole(self) -> Array | None:
+        """|coefficients| of all steps, and the rest, as one matrix; None where it would be large."""
+        # a sum of _ROW products, in any order, errs by less than the 1e-12 that whoever asks `_sizes` adds
+        steps, width, few = self.nodes - 1, len(self.columns), int(len(self.others) > 0)
+        if (terms := steps * (width + few)) > _ROW or terms * self.nodes * self.count > _ENTRIES:
+            return None
+        rows = np.zeros((self.nodes, self.count, steps, width + few))
+        for j, c in enumerate(self.coefficients):
+            rows[j + 1 :, :, j, :width] = np.abs(c).reshape(-1, self.count, width)
+            rows[j + 1 :, :, j, width:] = self.rest[j].reshape(steps - j, self.count, few)
+        return rows.reshape(self.nodes * self.count, terms)
 
     def errors(self, sizes: Array) -> Array:
         """Effect of the rounded adjoint rows for states with |s_j| <= ``sizes`` (N + 1, n): shape (M, D)."""

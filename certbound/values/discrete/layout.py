@@ -57,17 +57,16 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
     n, horizon = problem.system.dimension, int(problem.horizon)
     if problem.ending:
         return _of_domain(problem, np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (REACH * (1 + 1e-12)))
-    if shocks.laplace or shocks.steps is not None:
-        ends = [box_around(active_at(problem.constraints, t), n, t) for t in range(horizon + 1)]
-        if not np.isfinite(ends).all():
-            return _cut_line(problem, shocks, np.min([end[0] for end in ends]), np.max([end[1] for end in ends]))
-    low, high = np.empty((horizon + 1, n)), np.empty((horizon + 1, n))
+    ends = np.array([box_around(active_at(problem.constraints, t), n, t) for t in range(horizon + 1)])
+    low, high = ends[:, 0], ends[:, 1]
+    lacking = np.flatnonzero(~np.isfinite(ends).all(axis=(1, 2)))  # steps without some side
+    if len(lacking) and (shocks.laplace or shocks.steps is not None):
+        return _cut_line(problem, shocks, low.min(), high.max())
     far = max(REACH, shocks.reach)
     spread = far * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
     reach = start_box(problem)
     leak = 0.0
     for t in range(horizon + 1):
-        low[t], high[t] = box_around(active_at(problem.constraints, t), n, t)
         free = ~np.isfinite(low[t]) | ~np.isfinite(high[t])
         if np.any(free):
             if shocks.sizes is not None:
@@ -77,7 +76,7 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
             low[t] = np.where(below, low[t], reach[0] - 1e-9 * (1 + np.abs(reach[0])))
             high[t] = np.where(above, high[t], reach[1] + 1e-9 * (1 + np.abs(reach[1])))
         _check_box(problem, low[t], high[t], t, spread)
-        if t < horizon and _needed(problem, t):
+        if np.any(lacking > t):
             reach = _next_reach(dynamics, t, low[t], high[t], reach, spread)
     return Boxes(low, high, leak)
 
@@ -126,13 +125,6 @@ def start_box(problem: Problem) -> tuple[Array, Array]:
         return initial.mean - away, initial.mean + away
     around = initial.hull()
     return around.lo, around.hi
-
-
-def _needed(problem: Problem, t: int) -> bool:
-    """Whether some later step lacks a side."""
-    n = problem.system.dimension
-    later = range(t + 1, int(problem.horizon) + 1)
-    return any(not np.isfinite(box_around(active_at(problem.constraints, k), n, k)).all() for k in later)
 
 
 def _check_box(problem: Problem, low: Array, high: Array, t: int, spread: Array) -> None:

@@ -116,3 +116,19 @@ def test_rows_that_would_fill_the_memory_are_refused_before_they_are_made(monkey
     monkeypatch.setattr("certbound.gaussian.response.linear_response._MEMORY", 400)
     with pytest.raises(EngineError, match="GiB of memory, for 1 rows at 11 times"):
         RowResponse(response, 0, rows)
+
+
+@pytest.mark.parametrize("columns", [None, np.array([1, 3])])
+def test_all_steps_at_once_are_the_steps_one_by_one(columns, monkeypatch):
+    rng, steps, n = np.random.default_rng(4), 7, 4
+    slope = 0.8 * np.eye(n) + 0.2 * np.eye(n, k=1)
+    response = discrete_response(np.tile(slope, (1, steps, 1, 1)), np.eye(n), 0.0, np.zeros((n, n)))
+    rows, radii = rng.normal(size=(steps + 1, 3, n)), rng.uniform(0, 1, (steps, n))
+    found, slow = (RowResponse(response, 0, rows, columns) for _ in range(2))
+    assert found._whole is not None
+    monkeypatch.setattr("certbound.gaussian.response.linear_response._ENTRIES", 0)
+    assert slow._whole is None
+    np.testing.assert_allclose(found.boxes(radii), slow.boxes(radii), rtol=1e-14)
+    some = found.boxes(np.concatenate([radii[:4], np.full((3, n), np.inf)]))  # nothing is known from step 4 on
+    np.testing.assert_allclose(some[:5], found.boxes(radii)[:5], rtol=1e-14)
+    assert np.all(some[5:] == np.inf)

@@ -10,9 +10,11 @@ from scipy.stats import beta, norm
 
 import certbound as cb
 from certbound.problem.model.evaluation import compile_numpy
+from certbound.values.discrete import layout
 from certbound.values.discrete.failures import bound_failure
 from certbound.values.discrete.layout import without_hopeless
 from certbound.values.discrete.shocks import Inapplicable
+from certbound.values.sets import box_around
 
 
 def scalar(f: Any = None, **changes: Any) -> cb.Problem:
@@ -274,3 +276,16 @@ def test_sizes_of_cells_that_would_leave_too_wide_a_gap_are_left_out() -> None:
     assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, False, lambda share: True)[0] == 0.15
     assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, False, lambda share: share > 0.3) == left
     assert without_hopeless(left, (0.5, 2.8, 0.0), 1.05, False, lambda share: True) == left
+
+
+def test_boxes_of_long_horizons_cost_in_proportion(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def noted(constraints: Any, dimension: int, step: int) -> Any:
+        asked.append(step)
+        return box_around(constraints, dimension, step)
+
+    monkeypatch.setattr(layout, "box_around", noted)
+    problem = scalar(horizon=40, noise=cb.Gaussian(std=0.1))
+    assert bound_failure(problem, seconds=0.01).upper < 1
+    assert asked == list(range(41))
