@@ -21,7 +21,7 @@ from certbound.values.semilagrangian.bands import Band, Frame, through
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
 from certbound.values.semilagrangian.groundwork import Plan, layout_of
 from certbound.values.semilagrangian.noisy_axis import serves, setting_of
-from certbound.values.semilagrangian.remainders import chord_level, level_of, remainders, upper_tail
+from certbound.values.semilagrangian.remainders import bowed, level_of, remainders, upper_tail
 from certbound.values.semilagrangian.smoothers import WIDER, across, along
 from certbound.values.semilagrangian.smoothing import Lines, smoothed
 
@@ -65,7 +65,7 @@ def test_a_step_too_long_to_be_enclosed_is_not_known() -> None:
 def test_linear_models_leave_no_remainder() -> None:
     setting = setting_of(mechanical(lambda x: -x[0] - x[1], 0.4, [-1, -2], [1, 2]))
     box = Interval(np.array([-0.5]), np.array([0.5]))
-    found = remainders(setting.tape, 0.4, box, box, step=0.1, omega=5.0, chord=1.0)
+    found = remainders(setting.tape, 0.4, box, box, step=0.1, omega=5.0)
     assert found.known.all()
     assert not np.any([found.most, found.mean])
 
@@ -74,7 +74,7 @@ def test_remainder_and_dip_bound_what_simulated_paths_do(rng) -> None:
     setting = setting_of(mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1] * x[1], 0.5, [0, -2], [2, 2]))
     h, omega = 0.1, level_of(1e-6)
     point = Interval.point(np.array([1.2])), Interval.point(np.array([-0.5]))
-    bound = remainders(setting.tape, 0.5, *point, step=h, omega=omega, chord=chord_level(1e-6, omega))
+    bound = remainders(setting.tape, 0.5, *point, step=h, omega=omega)
     assert bound.known.all()
     count, parts = 4000, 100
     d = h / parts
@@ -93,17 +93,18 @@ def test_remainder_and_dip_bound_what_simulated_paths_do(rng) -> None:
         assert np.abs(left).mean() > mean / 60
     time = np.linspace(0, 1, parts + 1)[:, None]
     below = ((1 - time) * path[0] + time * path[-1] - np.array(path)).max()
-    assert 0.2 * bound.dip[0, 0] < below <= bound.dip[0, 0]
+    assert 0.2 * bound.bow[0] < below <= bound.dip[0, 0] + 1.5 * bound.bow[0]
 
 
 def test_levels_of_rare_events(rng) -> None:
     assert 4 * upper_tail(level_of(1e-9)) <= 1e-9 <= 4 * upper_tail(level_of(1e-9) * 0.999)
-    walk = np.cumsum(rng.standard_normal((4000, 400)), axis=1) / 20
+    walk = np.cumsum(rng.standard_normal((8000, 400)), axis=1) / 20
     time = np.arange(1, 401) / 400
-    swing = np.abs(time * walk.mean(axis=1, keepdims=True) - np.cumsum(walk, axis=1) / 400).max(axis=1)
-    level = chord_level(0.01, 4.0)
-    assert (swing > level).mean() < 0.01
-    assert (swing > level / 2).any()
+    bow = time * walk.mean(axis=1, keepdims=True) - np.cumsum(walk, axis=1) / 400
+    for near, far in ((0.1, 0.1), (0.3, 0.3), (0.5, 0.2), (1.0, 0.1)):
+        seen, bound = (bow > near * (1 - time) + far * time).any(axis=1).mean(), bowed(np.array([near]), far)[0]
+        assert seen - 3 * math.sqrt(seen / 8000) <= bound <= 1.6 * seen + 3 * math.sqrt(bound / 8000)
+    assert bowed(np.array([0.3, 0.4, 2.0, 30.0]), 0.3).tolist() == sorted(bowed(np.array([0.3, 0.4, 2.0, 30.0]), 0.3))[::-1]
 
 
 Y = np.concatenate([[-1.0, -0.7, -0.5], np.linspace(-0.4, 0.6, 41), [0.7, 0.9, 1.2]])
