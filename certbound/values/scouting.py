@@ -9,10 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _NODES = (141, 121)
 _KICKS = np.polynomial.hermite_e.hermegauss(5)
@@ -92,12 +96,15 @@ def scouted(
     return Scouted(p=p, q=q, visits=visits, steep_p=steep_p, steep_q=steep_q, cells=cells)
 
 
-def _chain(drift, noise, axes, points, length):  # type: ignore[no-untyped-def]
+def _chain(
+    drift: Callable[[Array, Array], Array], noise: float, axes: list[Array], points: tuple[Array, Array], length: float
+) -> tuple[csr_array | None, Array]:
     """The matrix of a step, and what leaves the box in it; (None, ...) where the drift is undefined."""
     from scipy.sparse import csr_array
 
     p, q = points
-    total, lost = None, np.zeros(len(p))
+    total: csr_array | None = None
+    lost = np.zeros(len(p))
     for kick, weight in zip(_KICKS[0], _KICKS[1] / _KICKS[1].sum()):
         push = np.array([0.0, noise * kick / np.sqrt(length)])[:, None]
         with np.errstate(all="ignore"):
