@@ -313,8 +313,6 @@ class RowResponse:
                 self.rest[j] = np.abs(later[:, self.others]).sum(axis=1) * (1 + 1e-12)
             current[j + 1 :] = _times(later, self.transition[j]).reshape(-1, self.count, n)
         self.initial = current
-        few = sum(part.nbytes for part in self.coefficients) <= _KEPT and self._whole is None
-        self.magnitudes = [np.abs(part) for part in self.coefficients] if few else None
 
     def _gather(self, parts: Iterator[Array]) -> Array:
         """Sum over j of the contributions of step j to all later nodes: shape (M, D), or (M, D, ...) as they are."""
@@ -334,11 +332,16 @@ class RowResponse:
             row = [own[:steps], bounds[:steps, self.others].max(axis=1, keepdims=True)] if few else [own[:steps]]
             flat = np.concatenate(row, axis=1).reshape(-1, *bounds.shape[2:])
             return np.asarray((whole @ flat).reshape(self.nodes, self.count, *bounds.shape[2:])[:, self.place])
-        sizes = map(np.abs, self.coefficients) if self.magnitudes is None else self.magnitudes
         return self._gather(
             size @ own[j] + (np.multiply.outer(self.rest[j], bounds[j, self.others].max(axis=0)) if few else 0.0)
-            for j, size in enumerate(sizes)
+            for j, size in enumerate(self._magnitudes or map(np.abs, self.coefficients))
         )
+
+    @cached_property
+    def _magnitudes(self) -> list[Array] | None:
+        """|coefficients|; None where they are large."""
+        few = sum(part.nbytes for part in self.coefficients) <= _KEPT
+        return [np.abs(part) for part in self.coefficients] if few else None
 
     @cached_property
     def _whole(self) -> Array | None:
