@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from certbound.gaussian.response.adjoint_rows import RowResponse
 from certbound.gaussian.response.clocks import ClockEvents, SteadyEvent
 from certbound.gaussian.response.events import WindowEvents
 from certbound.gaussian.response.levels import level_along, level_scale
 from certbound.gaussian.response.linear_response import (
     Jumps,
     LinearResponse,
-    RowResponse,
     balanced,
     continuous_response,
     discrete_response,

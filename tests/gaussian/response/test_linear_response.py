@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from certbound.errors import EngineError
-from certbound.gaussian.response.linear_response import RowResponse, continuous_response, discrete_response
+from certbound.gaussian.response.adjoint_rows import RowResponse
+from certbound.gaussian.response.linear_response import continuous_response, discrete_response
 from certbound.gaussian.response.step_events import StepEvents
 
 
@@ -113,7 +114,7 @@ def test_rows_that_would_fill_the_memory_are_refused_before_they_are_made(monkey
     response = discrete_response(np.full((1, 10, 1, 1), 0.5), np.eye(1), 0.0, np.zeros((1, 1)))
     rows = np.ones((11, 1, 1))
     assert RowResponse(response, 0, rows).count == 1
-    monkeypatch.setattr("certbound.gaussian.response.linear_response._MEMORY", 400)
+    monkeypatch.setattr("certbound.gaussian.response.adjoint_rows._MEMORY", 400)
     with pytest.raises(EngineError, match="GiB of memory, for 1 rows at 11 times"):
         RowResponse(response, 0, rows)
 
@@ -126,7 +127,7 @@ def test_all_steps_at_once_are_the_steps_one_by_one(columns, monkeypatch):
     rows, radii = rng.normal(size=(steps + 1, 3, n)), rng.uniform(0, 1, (steps, n))
     found, slow = (RowResponse(response, 0, rows, columns) for _ in range(2))
     assert found._whole is not None
-    monkeypatch.setattr("certbound.gaussian.response.linear_response._ENTRIES", 0)
+    monkeypatch.setattr("certbound.gaussian.response.adjoint_rows._ENTRIES", 0)
     assert slow._whole is None
     np.testing.assert_allclose(found.boxes(radii), slow.boxes(radii), rtol=1e-14)
     some = found.boxes(np.concatenate([radii[:4], np.full((3, n), np.inf)]))  # nothing is known from step 4 on
