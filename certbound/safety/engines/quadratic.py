@@ -13,7 +13,8 @@ from certbound.watch import seconds_left
 _SECONDS = 20.0  # about what may be spent, but by who asks for this engine alone, with a limit of his own
 _SPARED = {3: 5.0, 12: 18.0}  # the same, by the number of states, where other engines are asked too
 _LEAST = 0.1
-_ANY = 0.999  # a target that any bound meets
+_ANY = 1.0  # a target that any bound meets, even none: what the first walls say, unrefined
+_HASTE = 4.0  # seconds for these: the engine at work waits
 _FEW = 3  # states below which value functions on grids say more
 
 
@@ -31,6 +32,7 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         most = next((most for n, most in _SPARED.items() if problem.system.dimension <= n), _SECONDS)
         left = seconds_left()
         alone = asked.at_length or (asked.thorough and problem.system.dimension >= _FEW and left < math.inf)
+        most = min(most, _HASTE) if asked.first else most
         limit = max(left if alone else min(_SECONDS if asked.thorough else most, left), _LEAST)
         best = bound_quadratic(
             problem, target=_ANY if asked.first else problem.delta, seconds=limit, before=asked.before,

@@ -10,6 +10,7 @@ import pytest
 import certbound as cb
 from certbound.reach.linear import SplitAnswer, bisection
 from certbound.reach.linear.answer import linear_answer
+from certbound.watch import OutOfTime
 
 
 def flattening(reach: float = 0.9, std: float = 0.02, delta: float = 1e-3) -> cb.Problem:
@@ -99,6 +100,27 @@ def test_where_one_start_is_out_of_reach_nothing_is_halved(monkeypatch: pytest.M
     monkeypatch.setattr(bisection, "run_of", counted)
     assert linear_answer(flattening(std=0.2)).log10_delta > -3
     assert len(made) == 1
+
+
+def test_what_time_ended_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch, split: SplitAnswer) -> None:
+    original, seen, ended = bisection._look, [], []
+
+    def look(*args: Any) -> Any:
+        if args[-1]:
+            seen.append(args[3].path)
+        if len(seen) == 4 and not ended:
+            ended.append(seen[-1])
+            raise OutOfTime
+        return original(*args)
+
+    first = linear_answer(flattening(), thorough=False)
+    monkeypatch.setattr(bisection, "_look", look)
+    with pytest.raises(OutOfTime):
+        linear_answer(flattening(), before=first)
+    found = linear_answer(flattening(), before=first)
+    assert isinstance(found, SplitAnswer)
+    assert [path for path in set(seen) if seen.count(path) > 1] == ended
+    assert (found.paths, found.log10_delta) == (split.paths, split.log10_delta)
 
 
 def test_a_smaller_set_of_starts_is_never_worse(split: SplitAnswer) -> None:

@@ -1,0 +1,33 @@
+"""The engine of quadratic value bounds: what it asks of the search."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import InfeasibleError
+from certbound.safety.answers import Request
+from certbound.safety.engines import quadratic, quadratic_engine
+from certbound.watch import Watch
+
+
+def test_a_first_bound_is_what_the_first_walls_say_and_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def search(problem: cb.Problem, **options: Any) -> None:
+        asked.append(options)
+        raise InfeasibleError("nothing.")
+
+    monkeypatch.setattr(quadratic, "bound_quadratic", search)
+    system = cb.ContinuousSystem(lambda x: [-x[i] for i in range(4)], states=4, diffusion=0.1 * np.eye(4))
+    problem = cb.Problem(system, initial=[0] * 4, safe=[cb.Inside(cb.Box([-1] * 4, [1] * 4))], horizon=1, delta=1e-3)
+    with Watch(60.0).running():
+        quadratic_engine(problem, Request(first=True, thorough=False))
+        quadratic_engine(problem, Request(thorough=False))
+    first, later = asked
+    assert first["target"] == 1.0  # whatever is found, and nothing, is enough
+    assert first["seconds"] < 5 < later["seconds"]
+    assert later["target"] == 1e-3
