@@ -122,8 +122,10 @@ def _check_extent(start: Region) -> None:
     slack = 1e-6 * np.maximum(high - low, 1e-6 * np.abs(high + low))
     if np.any((around.lo > low + slack) | (around.hi < high - slack)):
         name = type(start).__name__
-        raise ValueError(f"`initial` reaches from {low} to {high} by its form, and its `extent` ends at {around.lo} and "
-                         f"{around.hi}; let `extent` of {name} hold the whole set, or leave it out.")  # fmt: skip
+        raise ValueError(
+            f"`initial` reaches from {low} to {high} by its form, and its `extent` from {around.lo} to "
+            f"{around.hi}; let `extent` of {name} hold the whole set, or leave it out."
+        )
 
 
 def _checked_weight(name: str, value: Any, size: int, *, strict: bool) -> Array:

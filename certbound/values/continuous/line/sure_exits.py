@@ -52,8 +52,8 @@ def leaves_surely(problem: Problem) -> SureExit | None:
     """Why every path leaves the safe set in the end; None where that is not proved.
 
     No target, limits that always hold and stand still, a model without t, and in continuous time no path that may run
-    off to infinity before it leaves. An EnclosureError where the model is undefined somewhere in the box around the safe
-    set.
+    off to infinity before it leaves. An EnclosureError where the model is undefined somewhere in the box around the
+    safe set.
     """
     system = problem.system
     square = _square(system)
