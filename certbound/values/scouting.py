@@ -52,7 +52,7 @@ def scouted(
     drift: Callable[[Array, Array], Array], noise: float, faces: tuple[tuple[float, float], tuple[float, float]],
     starts: Array, horizon: float, steps: int, broken: Callable[[Array, Array], Mask],
 ) -> Scouted | None:  # fmt: skip
-    """Follow dp = F dt, dq = g dt + s dW; None where nothing fails, or the drift is undefined somewhere.
+    """Follow dp = F dt, dq = g dt + s dW; None where nothing fails or all does, or the drift is undefined.
 
     Parameters
     ----------
@@ -92,6 +92,8 @@ def scouted(
         steep_p += share * slopes[0].ravel() ** 2
         steep_q += share * np.abs(slopes[1].ravel()) ** 3
         mass = back @ np.where(fails, 0.0, mass)
+    if not (steep_p.any() and steep_q.any()):
+        return None
     cells = float(axes[0][1] - axes[0][0]), float(axes[1][1] - axes[1][0])
     return Scouted(p=p, q=q, visits=visits, steep_p=steep_p, steep_q=steep_q, cells=cells)
 

@@ -209,7 +209,7 @@ def _marked(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: B
 
 def _bent(near: Array) -> Array:
     """`bowed` of the largest number of a table that is not above ``near``, from `SHORT` on."""
-    table = SHORT * 1.03 ** np.arange(150)
+    table = np.geomspace(SHORT, 80 * SHORT, 150)
     return np.asarray(bowed(table, SHORT)[np.clip(np.searchsorted(table, near, side="right") - 1, 0, None)])
 
 

@@ -265,12 +265,12 @@ def _along_y(scout: Scouted, clock: Clock, plan: Plan, places: Array, sigma: flo
     bins = np.linspace(places[0], places[-1], 401)
     width = bins[1] - bins[0]
     share = np.histogram(scout.p - clock.shear * scout.q, bins, weights=scout.steep_p)[0] / width
-    reach = max(1, math.ceil((scout.cells[0] + clock.shear * scout.cells[1] + 2 * sigma) / width))
+    reach = max(1, math.ceil((scout.cells[0] + abs(clock.shear) * scout.cells[1] + 2 * sigma) / width))
     share = np.convolve(share, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode="same")
     share = np.maximum(share, 1e-9 * share.max())
     root = np.cbrt(share)
     found = math.sqrt(12 * plan.loss * clock.step / float(root.sum() * width)) / root
-    return np.interp(places, (bins[1:] + bins[:-1]) / 2, found)
+    return np.asarray(np.interp(places, (bins[1:] + bins[:-1]) / 2, found))
 
 
 def _along_q(scout: Scouted, places: Array) -> Array:
@@ -279,7 +279,7 @@ def _along_q(scout: Scouted, places: Array) -> Array:
     share = np.histogram(scout.q, bins, weights=scout.steep_q)[0]
     share = np.maximum(np.convolve(share, np.full(3, 1 / 3), mode="same"), 1e-9 * share.max())
     found = np.clip((share / share.max()) ** -0.25, 1.0, _COARSEST[1])
-    return np.interp(places, (bins[1:] + bins[:-1]) / 2, found)
+    return np.asarray(np.interp(places, (bins[1:] + bins[:-1]) / 2, found))
 
 
 def _upright(
