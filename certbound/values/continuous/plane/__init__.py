@@ -24,6 +24,6 @@ from certbound.values.continuous.plane.two_sides import (
 
 __all__ = [
     "Floats", "Pair", "Plan", "Plane", "Solver", "Source", "bound_failing", "bound_moving", "bound_plane_above",
-    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "plane_of", "reach_of", "released", "rough_level",
-    "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
+    "bound_windows", "chart_plane", "held_plane", "integrated", "moving", "plane_of", "reach_of", "released",
+    "rough_level", "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
 ]
