@@ -49,10 +49,9 @@ _FAR = 40.0
 """Standard deviations of a random start beyond the grid that are looked at from below."""
 _DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
 """Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""
+_LEAST = 2.0**-20  # V is at least so far below 0 where paths end that have not left, so that exp(V) is not 1
 _ENTRIES = 4_000_000
 _CHUNK = 4096
-_HIGHEST = -0.05
-"""Of the logarithm of what counts where paths end that have not left: any number below 0 would do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +173,7 @@ class Passage:
         else:
             found = (later + v0 + self.levels.above(v0)).exp()
         found += (v0 + most).exp() * total
-        floor = arb.min(arb(self._at_end()), arb(_HIGHEST)).exp()
+        floor = arb.min(arb(self._at_end()), arb(-_LEAST)).exp()
         return arb.min((found - floor) / (1 - floor), arb(1)).upper()
 
     def _check_box(self) -> None:
@@ -292,9 +291,9 @@ class Passage:
             if self.due is not None:  # nothing is asked where paths are over
                 here = np.flatnonzero(np.tile(self.due.ravel(), last - first))
                 patches, slab = patches.take(here), slab[here]
-            for degree in self.degrees:
-                need = self._needs(patches, slab, start, degree)
-                settled = (need <= self.stated[slab]) | (degree == self.degrees[-1])
+            for degree, parts in (looks := [*((degree, 1) for degree in self.degrees), (self.degrees[-1], 2)]):
+                need = self._needs(patches, slab, start, degree, parts)
+                settled = (need <= self.stated[slab]) | ((degree, parts) == looks[-1])
                 np.maximum.at(lam, slab[settled], need[settled])
                 rest = np.flatnonzero(~settled)
                 patches, slab = patches.take(rest), slab[rest]
@@ -302,27 +301,27 @@ class Passage:
             raise Unproved("the dynamics was not shown to be defined where V is negative")
         return lam
 
-    def _needs(self, patches: Patches, slab: Index, start: float, degree: int) -> Array:
-        """What every patch needs as lam, from Taylor models of some degree."""
+    def _needs(self, patches: Patches, slab: Index, start: float, degree: int, parts: int) -> Array:
+        """What every patch needs as lam, from Taylor models of some degree, bounded on equal parts."""
         which = terms(self._variables(), degree)
         need, size = np.zeros(len(slab)), max(32, _ENTRIES // (degree + 1) ** which.variables)
         for first in range(0, len(slab), size):
             self.budget.check()
             part = slice(first, first + size)
-            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which)
+            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which, parts)
         return need
 
     def _variables(self) -> int:
         """Of the Taylor models: time, the states and the disturbances."""
         return 1 + self.model.dimension + len(self.model.disturbance)
 
-    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms, parts: int) -> Array:
         low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
         low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
         need, due = np.zeros(len(eps)), np.flatnonzero(~(low >= 0))
         if len(due):
             low, high = low[due], high[due]
-            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends()[1]
+            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends(parts)[1]
             reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
             found = (excess - eps[due] * reach * (1 - 1e-12)) * (1 + 1e-12)
             need[due] = np.where(np.isfinite(excess), np.maximum(found, 0.0), np.inf)

@@ -81,15 +81,16 @@ def test_taylor_models_hold_the_function_everywhere_on_their_boxes(function: Any
     high = low + rng.choice([0.0, 0.01, 0.2, 0.7], (2, 60))
     with np.errstate(all="ignore"):
         (found,) = run(tape, [tm.variable(which, i, low[i], high[i]) for i in range(2)])
-        ends, sharp = found.ends(), found.sharp_ends()
+        ends, sharp, sharper = found.ends(), found.sharp_ends(), found.sharp_ends(3)
     for xi in itertools.product((-1.0, -0.3, 0.55, 1.0), repeat=2):
         x = (low + high) / 2 + np.array(xi)[:, None] * (high - low) / 2
         truth = np.array([function(point)[0] for point in x.T])
         assert (np.abs(value_of(found, np.array(xi)) - truth) <= found.error + 1e-15).all()
-        for bottom, top in (ends, sharp):
+        for bottom, top in (ends, sharp, sharper):
             assert (truth >= bottom - 1e-15).all()
             assert (truth <= top + 1e-15).all()
     assert np.isfinite(found.error).mean() > 0.5
+    assert not ((sharper[0] < sharp[0] - 1e-9) | (sharper[1] > sharp[1] + 1e-9)).any()
 
 
 def test_what_is_undefined_or_jumps_on_a_box_is_unknown() -> None:
@@ -540,7 +541,7 @@ def test_lam_of_the_file_proves_nothing(exiting: str) -> None:
     data["proof"]["lam"] = exact([1e9] * len(data["proof"]["lam"]))
     generous = check_data(data).log10_proved
     data["proof"]["lam"] = exact([-1e9] * len(data["proof"]["lam"]))
-    assert generous >= check_data(data).log10_proved >= check_data(parse(exiting)).log10_proved - 1e-3
+    assert generous >= check_data(data).log10_proved >= check_data(parse(exiting)).log10_proved - 3e-3  # a closer look proves more
 
 
 def test_a_door_writes_what_the_checker_proves() -> None:

@@ -36,9 +36,10 @@ Proposed = tuple[Surface, Payment]
 Found = tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]
 
 _RARE = math.log(1e-7)
-_CELLS = (24, 34, 48, 68)
-_COST = 0.012  # about the seconds of both sides, over cells^2
-_SHARE = 0.75  # of what may be spent
+_FEWEST, _MOST = 14, 60  # cells along each state
+_COARSE = 0.55  # of the cells that may be afforded, for a first grid
+_COST = 0.01  # about the seconds of both sides, over cells^2
+_SHARE = 0.58  # of what may be spent, for the finer grid
 _LEAD = 6.0  # over cells^2: a ramp's share of the horizon
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
@@ -51,7 +52,8 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
     """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
     granted, starts = deadline - time.perf_counter(), starts_of(problem)
     inner = plane_of(problem, model, room.inner_low, room.inner_high, starts)
-    if not inner.autonomous or len(model.branches) > 1 or held_plane(inner, model)[0] is not inner:
+    served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
+    if not served or held_plane(inner, model)[0] is not inner:
         return two_states(problem, model, room, deadline, wanted)
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
     outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
@@ -61,10 +63,9 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
         return two_states(problem, model, room, deadline, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below = list[Proposed](), list[Proposed]()
-    for cells in _CELLS:
+    most = min(math.sqrt(_SHARE * granted / _COST), _MOST)
+    for cells in sorted({max(round(share * most), _FEWEST) for share in (_COARSE, 1.0)}):
         cost = _COST * cells**2
-        if done and spent + cost > _SHARE * granted:
-            break
         try:
             found = _bounded(inner, model, cells, None, below=False)
             done.append(f"{cells}^2")
@@ -116,7 +117,7 @@ def _bounded(plane: Plane, model: Model, cells: int, points: Array | None, *, be
         else:
             payment, proof = proved_upper(surface, model, starts, (), spare)
             needed = np.where(proof.ranges.low < 0, proof.ranges.residual_high, 0.0)
-        if payment is not None and (best is None or (payment.log > best[1].log if below else payment.log < best[1].log)):
+        if payment is not None and (best is None or (payment.log - best[1].log) * (1 if below else -1) > 0):
             best = surface if below else raised_above(surface), payment
         if factor is None or not np.isfinite(needed).all():
             break

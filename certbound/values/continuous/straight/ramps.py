@@ -1,8 +1,8 @@
 """Floating-point proposals of the probability U itself in two states; nothing here is certified.
 
-U_tau = f.grad U + tr(a U'') / 2 + s, tau = T - t, is linear: collocation with quintic splines along both axes, and steps
-of the Radau IIA method of three stages (order 5, L-stable; Hairer and Wanner, Solving Ordinary Differential Equations
-II, Sec. IV.5), whose three systems are one real and one complex one (Sec. IV.8). Steps double as tau grows.
+U_tau = f.grad U + tr(a U'') / 2 + s, tau = T - t, is linear: collocation with quintic splines along both axes, and
+steps of the Radau IIA method of three stages (order 5, L-stable; Hairer and Wanner, Solving Ordinary Differential
+Equations II, Sec. IV.5), whose three systems are one real and one complex one (Sec. IV.8). They double as tau grows.
 
 *Ramps.* U = 0 at T and 1 on the faces do not go together. So on a face U rises: 1 - U falls at a rate k(tau), and moves
 along the face like the process whose motion across the face is left out; in a corner both faces' rates add up. So

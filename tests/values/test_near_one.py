@@ -1,0 +1,67 @@
+"""The probability itself as a proposal in two states: both bounds beside a truth that is known."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.values.continuous import exits, straight
+from certbound.values.continuous.hypotheses import prove_lower, prove_upper
+from certbound.values.continuous.plane import Plane, plane_of
+from certbound.values.continuous.room import safe_room, starts_of
+from certbound.values.continuous.straight import near_one, ramps
+
+
+def free() -> cb.Problem:
+    """Two Brownian motions."""
+    gain = 0.6 * np.eye(2)
+    system = cb.ContinuousSystem(lambda x: [0 * x[0], 0 * x[1]], states=2, diffusion=gain)
+    return cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
+
+
+def plane(problem: cb.Problem) -> tuple[Plane, exits.Model]:
+    model, room = exits._model(problem), safe_room(problem)
+    return plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem)), model
+
+
+def test_both_bounds_are_near_the_truth_and_hold_on_spoilt_proposals() -> None:
+    odd = 2 * np.arange(30) + 1.0
+    stays = 4 / np.pi * float(np.sum((-1.0) ** np.arange(30) / odd * np.exp(-((0.6 * np.pi * odd) ** 2) / 8)))
+    truth = math.log(1 - stays**2)
+    inner, model = plane(free())
+    above = near_one._bounded(inner, model, 10, None, below=False)
+    below = near_one._bounded(inner, model, 10, None, below=True)
+    assert above is not None
+    assert below is not None
+    assert truth - 0.5 < below[1].log <= truth <= above[1].log < truth + 0.4
+    rng = np.random.default_rng(1)
+    spoilt = [
+        dataclasses.replace(one, values=one.values * (1 + 1e-6 * rng.normal(size=one.values.shape)))
+        for one, _ in (above, below)
+    ]
+    assert prove_upper(spoilt[0].raised(-1e-3), model, inner.starts).log >= truth
+    payment = prove_lower(spoilt[1].raised(1e-3), model, inner.starts)
+    assert payment is None or payment.log <= truth
+
+
+def test_a_face_that_no_upper_proposal_reaches_is_raised() -> None:
+    inner, _ = plane(free())
+    surface = ramps.Ramps(inner, 8, 0.1).surface(None, below=False)
+    low = [surface.face_range(axis, side)[0] for axis in (0, 1) for side in (0, 1)]
+    assert min(low) > -1e-9 * ramps.SMALL
+    assert surface.times[0] == 0
+    assert surface.times[-1] == 1
+
+
+def test_where_it_does_not_serve_the_logarithm_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(near_one, "two_states", lambda *given: "the logarithm")
+    swaying = cb.ContinuousSystem(lambda t, x: [-x[0], np.sin(t) - x[1]], states=2, diffusion=0.8 * np.eye(2))
+    for problem, seconds in ((free().replace(system=swaying), 60.0), (free(), 0.1)):
+        found = straight.bound_plane(
+            problem, exits._model(problem), safe_room(problem), near_one.time.perf_counter() + seconds, -math.inf
+        )
+        assert found == "the logarithm"
