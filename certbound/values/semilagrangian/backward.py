@@ -35,6 +35,8 @@ class Bounds:
     mirrors : sequence of Mirror
     below : bool
         Whether this is about -L.
+    paid : ndarray, shape (ny - 1, nq - 1), or 0
+        What every cell pays besides in a step.
     """
 
     level: Array
@@ -43,6 +45,7 @@ class Bounds:
     reach: tuple[int, int]
     mirrors: Sequence[Mirror] = ()
     below: bool = False
+    paid: Array | float = 0.0
 
 
 def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines:
@@ -61,7 +64,7 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
         bend[nodes] = np.maximum(bend[nodes], curve)
         payment[band.first : band.last] = paid
     bend = np.where(np.isfinite(bend), bend, 0.0)
-    return limited(frame, bounds, nodal + around_nodes(payment, largest=True), bend)
+    return limited(frame, bounds, nodal + around_nodes(payment + bounds.paid, largest=True), bend)
 
 
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:

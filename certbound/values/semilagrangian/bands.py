@@ -121,7 +121,7 @@ def band_of(
         factor = 0.0
     drift = frame.drift[:, first:last] * factor
     error = one.error + max(part.error for part in two) + 1e-13 + 8e-16 * (len(frame.y[lines]) + 2 * len(frame.q))
-    amplified = [_amplified(frame, slice(first, last), frame.y[lines], mesh, (sigma[0], s)) for s in sigmas]
+    amplified = [_amplified(frame, slice(first, last), frame.y[lines], mesh, (sigma[0], s), reach) for s in sigmas]
     rounding = error * np.maximum(*amplified)
     prices = np.stack([more / 2, excess[1], excess[0] / 2, drift[0], drift[1], rounding]) * _UP
     return Band(
@@ -130,11 +130,11 @@ def band_of(
     )  # fmt: skip
 
 
-def _amplified(frame: Frame, cells: slice, lines: Array, mesh: Array, sigma: tuple[float, float]) -> Array:
+def _amplified(
+    frame: Frame, cells: slice, lines: Array, mesh: Array, sigma: tuple[float, float], reach: Array
+) -> Array:
     """Lambda of "Rounding" (docs/values.md), K8-SL: by how much errors of the kernels' entries grow, cell by cell."""
-    least, fine = float(np.diff(lines).min()), float(np.diff(frame.q).min())
-    widest = float(np.diff(frame.q).max())
-    ratio = max(1.0, float(np.diff(mesh).max()) / least)
+    fine, widest = float(np.diff(frame.q).min()), float(np.diff(frame.q).max())
     nodes = slice(cells.start, cells.stop + 1)
     d, e = np.diff(frame.y)[cells, None], np.diff(frame.q)
     slopes, bends = np.abs(frame.slopes[:, cells]), frame.bends[:, cells]
@@ -143,6 +143,7 @@ def _amplified(frame: Frame, cells: slice, lines: Array, mesh: Array, sigma: tup
     sides = np.maximum(around[:, 1:], around[:, :-1]) + bends[2:] * e**2
     step = [np.maximum(np.maximum(slopes[2 * k], slopes[2 * k + 1]) * d, sides[k]) for k in (0, 1)]
     turn = [np.maximum(bends[k] * d**2, bends[2 + k] * e**2) for k in (0, 1)]
+    least, ratio = _nearby(image[0], step[0] + turn[0] + reach, lines, mesh, (REACH + 0.1) * sigma[0])
     loose = radius[0].max() / least + radius[1].max() / fine
     up, across = step[0] / least, step[1] / sigma[1]
     bow = turn[0] / least
@@ -150,6 +151,28 @@ def _amplified(frame: Frame, cells: slice, lines: Array, mesh: Array, sigma: tup
     found = found + 23 * bow * (1 + widest / sigma[1]) + 90 * ratio * turn[1] * widest / fine**2 + 110 * ratio**2
     found = found + 60 * ratio * (sigma[1] / fine) ** 2 + (sigma[0] / least + sigma[1] / fine) ** 2
     return np.asarray(2 * found * _UP)
+
+
+def _nearby(image: Array, more: Array, lines: Array, mesh: Array, reach: float) -> tuple[Array, Array]:
+    """d and r of "Rounding" for every cell: of lines and mesh cells that smoothing near its image meets."""
+    corners = [image[a, b] for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None))]
+    low, high = np.minimum.reduce(corners) - more - reach, np.maximum.reduce(corners) + more + reach
+    found = []
+    for axis, pick in ((lines, np.minimum), (mesh, np.maximum)):
+        widths = np.diff(axis)
+        tables = [widths]  # extremes of 1, 2, 4, ... cells from each on
+        while 2 ** len(tables) <= len(widths):
+            half = 2 ** (len(tables) - 1)
+            tables.append(pick(tables[-1][:-half], tables[-1][half:]))
+        first = np.clip(np.searchsorted(axis, low) - 2, 0, len(widths) - 1)
+        last = np.clip(np.searchsorted(axis, high) + 2, first + 1, len(widths))
+        level = np.log2(last - first).astype(int)
+        best = np.zeros(low.shape)
+        for k, table in enumerate(tables):
+            here = level == k
+            best[here] = pick(table[first[here]], table[last[here] - 2**k])
+        found.append(best)
+    return found[0], np.maximum(1.0, found[1] / found[0])
 
 
 def _far_from_ends(

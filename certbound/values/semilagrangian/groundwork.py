@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,15 +11,25 @@ from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete import evaluate
-from certbound.values.grids import Grid, graded_axis
+from certbound.values.grids import Grid
+from certbound.values.scouting import Scouted
 from certbound.values.semilagrangian.backward import Bounds, bounds_below, levels_above
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
 from certbound.values.semilagrangian.confines import Wall
 from certbound.values.semilagrangian.flows import flow, sheared
-from certbound.values.semilagrangian.local_steps import Blocks, Clock, base_of, blocks_of, height_on
+from certbound.values.semilagrangian.local_steps import (
+    SHORT,
+    Blocks,
+    Clock,
+    Plan,
+    axes_of,
+    base_of,
+    blocks_of,
+    height_on,
+)
 from certbound.values.semilagrangian.mirrors import mirrors_of
 from certbound.values.semilagrangian.noisy_axis import Setting
-from certbound.values.semilagrangian.remainders import chord_level, level_of
+from certbound.values.semilagrangian.remainders import bowed, level_of
 from certbound.watch import poll
 
 _BLOCKS = (90, 40)
@@ -29,30 +38,6 @@ _ORDERS = (4, 8, 7)
 _MOST_BANDS = 12
 _APART = 0.02  # how far apart the variances of a band's cells may be
 _MOST_REACH = 6
-_MIRRORED = 6.0  # standard deviations beyond q's faces over which nodes are mirror images
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Plan:
-    """How fine: steps, and the cells' sizes.
-
-    Attributes
-    ----------
-    count : int
-        Steps.
-    fine, wide : float
-        Cells along y at the faces, in units of sigma_y, and the most anywhere, in units of the safe set's width.
-    cell : float
-        Cells along q, in units of sigma_q.
-    spare : float
-        Probability per step that may be paid for each rare event.
-    """
-
-    count: int
-    fine: float
-    wide: float
-    cell: float
-    spare: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -66,7 +51,7 @@ class Layout:
     below: Bounds
 
 
-def layout_of(setting: Setting, plan: Plan) -> Layout:
+def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Layout:
     """Prepare the steps.
 
     Raises
@@ -77,7 +62,7 @@ def layout_of(setting: Setting, plan: Plan) -> Layout:
     clock = _clock(setting, plan)
     p, q = setting.faces
     rough = _rough(setting, clock)
-    axes = _axes(setting, clock, plan, rough)
+    axes = axes_of(setting, clock, plan, rough, scout)
     index, edges = zip(*(_chunks(axis, count) for axis, count in zip(axes, _BLOCKS)))
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
     blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
@@ -93,12 +78,12 @@ def layout_of(setting: Setting, plan: Plan) -> Layout:
     everywhere = np.ones(level.shape, dtype=bool)
     return Layout(
         clock=clock, frame=frame, bands=bands,
-        above=Bounds(level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above),
+        above=Bounds(level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above, paid=marked.bent),
         below=bounds_below(live, marked.broken, reach, below),
     )  # fmt: skip
 
 
-def nodes_of(setting: Setting, plan: Plan) -> int:
+def nodes_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> int:
     """How many nodes the grid of a plan has, found at a fraction of the cost of `layout_of`.
 
     Raises
@@ -107,7 +92,7 @@ def nodes_of(setting: Setting, plan: Plan) -> int:
         As for `layout_of`.
     """
     clock = _clock(setting, plan)
-    y, q = _axes(setting, clock, plan, _rough(setting, clock))
+    y, q = axes_of(setting, clock, plan, _rough(setting, clock), scout)
     return len(y) * len(q)
 
 
@@ -115,9 +100,8 @@ def _clock(setting: Setting, plan: Plan) -> Clock:
     omega = level_of(plan.spare)
     step = setting.horizon / plan.count
     first = Clock(
-        step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega,
-        chord=chord_level(plan.spare, omega),
-    )  # fmt: skip
+        step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega
+    )
     blocks = _rough(setting, replace(first, shear=0.0))
     known = _some(blocks.known)
     ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
@@ -139,54 +123,6 @@ def _rough(setting: Setting, clock: Clock) -> Blocks:
     away = sorted((clock.shear * q0, clock.shear * q1))
     ends = np.linspace(p0 - away[1], p1 - away[0], 21), np.linspace(q0, q1, 15)
     return blocks_of(setting, clock, *ends, order=_ORDERS[0])
-
-
-def _axes(setting: Setting, clock: Clock, plan: Plan, rough: Blocks) -> tuple[Array, Array]:
-    (p0, p1), (q0, q1) = setting.faces
-    known = _some(rough.known)
-    yy, qq = rough.covariance[0].mid, rough.covariance[2].mid
-    sigma = math.sqrt(max(float(np.median(yy[known])), 0.0)), math.sqrt(float(np.median(qq[known])))
-    if not sigma[0] > 1e-7 * (p1 - p0):
-        raise InfeasibleError(
-            "the noise hardly reaches the coordinate without noise; value functions prove nothing here."
-        )
-    dip = rough.strays.dip[:, known]
-    p0, p1 = p0 + float(np.median(dip[0])), p1 - float(np.median(dip[1]))
-    away = sorted((clock.shear * q0, clock.shear * q1))
-    tube = rough.strays.tube
-    keep = known
-    ends = [float(tube[0].lo[keep].min()), float(tube[0].hi[keep].max())]
-    tall = [float(tube[1].lo[keep].min()), float(tube[1].hi[keep].max())]
-    slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
-    low = min(ends[0] - slant[1], p0 - away[1]) - 13 * sigma[0]
-    high = max(ends[1] - slant[0], p1 - away[0]) + 13 * sigma[0]
-    places = np.linspace(low, high, 4001)
-    gap = np.full(len(places), np.inf)
-    for end, slant in _upright(setting, clock.shear, (p0, p1)):
-        gap = np.minimum(gap, np.maximum(np.maximum(end - slant[1] - places, places - end + slant[0]), 0.0))
-    wanted = np.minimum(plan.fine * sigma[0] + 0.1 * gap, plan.wide * (p1 - p0))
-    y = graded_axis(low, high, places, np.maximum(wanted, 1e-12))
-    count = max(8, math.ceil((q1 - q0) / (plan.cell * sigma[1])))
-    core = np.linspace(q0, q1, count + 1)
-    beyond = 11 * sigma[1] + max(q0 - tall[0], tall[1] - q1, 0.0)
-    near = (core[1] - core[0]) * np.arange(1, math.ceil(_MIRRORED * sigma[1] / (core[1] - core[0])) + 1)
-    steps = near[-1] + np.cumsum(np.minimum(plan.cell * 1.35 ** np.arange(1, 60), 1.6)) * sigma[1]
-    steps = np.concatenate([near, steps[: int(np.searchsorted(steps, beyond)) + 1]])
-    return y, np.concatenate([q0 - steps[::-1], core, q1 + steps])
-
-
-def _upright(setting: Setting, shear: float, ends: tuple[float, float]) -> Iterator[tuple[float, list[float]]]:
-    """Places of p where the safe set ends along q, about, each with the range of shear q there."""
-    faces = setting.faces[1]
-    for end, limit in zip(ends, setting.beyond[0]):
-        if math.isfinite(limit):
-            yield end, sorted(shear * q for q in faces)
-    for wall in setting.walls:
-        hull = wall.hull()
-        tall = sorted(shear * float(np.clip(q, *faces)) for q in (hull.lo[1], hull.hi[1]))
-        for end in (float(hull.lo[0]), float(hull.hi[0])):
-            if math.isfinite(end):
-                yield end, tall
 
 
 def _chunks(axis: Array, count: int) -> tuple[Index, Array]:
@@ -231,21 +167,22 @@ class _Marks:
     """What is known of the cells, shape (ny - 1, nq - 1) each.
 
     ``safe``: they lie in the safe set, far enough from p's faces; ``broken``: no point of theirs is safe; ``boxed``:
-    within the box, or across its end where that is a limit; ``crossed``: a path may end there that has met a wall.
+    within the box, or across its end where that is a limit; ``crossed``: a path may end there that has met a wall;
+    ``bent`` bounds the probability that a path leaves through a face of p within the step and ends far enough inside.
     """
 
     safe: Mask
     broken: Mask
     boxed: Mask
     crossed: Mask
+    bent: Array
 
 
 def _marked(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask) -> _Marks:
     y, q = axes
-    dips = blocks.strays.dip
-    touched = [float(np.where(usable, d, 0.0).max()) for d in dips]
     p, faces = setting.faces
-    dip = _dips(blocks, usable, clock, p, touched)
+    strays, bows = _strays(blocks, usable, p)
+    dip = [stray + SHORT * bow for stray, bow in zip(strays, bows)]
     ends = Interval(q[:-1], q[1:])
     places = Interval(y[:-1], y[1:])[:, None] + (ends * clock.shear)[None]
     heights = ends[None].broadcast_to(places.shape)
@@ -264,7 +201,16 @@ def _marked(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: B
         near = np.isfinite(margins[0])
         kept = wall.safe(sizes, np.where(near, margins, 0.0).reshape(len(margins), -1)).reshape(safe.shape)
         crossed |= near & ~kept
-    return _Marks(safe=safe, broken=broken, boxed=np.asarray(boxed), crossed=crossed)
+    bent = np.zeros(safe.shape)
+    for away, stray, bow in zip((places.lo - p[0], p[1] - places.hi), strays, bows):
+        bent += _bent((away - stray) / bow) if bow > 0 else 0.0
+    return _Marks(safe=safe, broken=broken, boxed=np.asarray(boxed), crossed=crossed, bent=bent)
+
+
+def _bent(near: Array) -> Array:
+    """`bowed` of the largest number of a table that is not above ``near``, from `SHORT` on."""
+    table = np.geomspace(SHORT, 80 * SHORT, 150)
+    return np.asarray(bowed(table, SHORT)[np.clip(np.searchsorted(table, near, side="right") - 1, 0, None)])
 
 
 def _near_wall(
@@ -311,12 +257,12 @@ def _frame(
     )  # fmt: skip
 
 
-def _dips(blocks: Blocks, usable: Mask, clock: Clock, p: tuple[float, float], most: list[float]) -> tuple[float, float]:
-    """How far the noise-free faces move inward: the largest dip of the blocks whose tube may meet a face."""
+def _strays(blocks: Blocks, usable: Mask, p: tuple[float, float]) -> tuple[list[float], list[float]]:
+    """The largest dips below (above) chords, and bows, of the blocks from which a path may meet p's faces."""
     low, high = blocks.strays.tube[0].lo, blocks.strays.tube[0].hi
-    dips = blocks.strays.dip
-    near = (usable & (low <= p[0] + most[0]), usable & (high >= p[1] - most[1]))
-    return float(np.where(near[0], dips[0], 0.0).max()), float(np.where(near[1], dips[1], 0.0).max())
+    near = (usable & (low <= p[0]), usable & (high >= p[1]))
+    dips = [float(np.where(keep, dip, 0.0).max()) for keep, dip in zip(near, blocks.strays.dip)]
+    return dips, [float(np.where(keep, blocks.strays.bow, 0.0).max()) for keep in near]
 
 
 def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> tuple[Array, Array, Mask]:

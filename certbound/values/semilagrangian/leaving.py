@@ -7,15 +7,18 @@ import time
 
 import numpy as np
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Mask
 from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
+from certbound.rigor.intervals import Interval
 from certbound.values.continuous import ExitBounds
 from certbound.values.grids import around_nodes
+from certbound.values.scouting import Scouted, scouted
 from certbound.values.semilagrangian.backward import Bounds, back, highest, limited, lowest
 from certbound.values.semilagrangian.carried import bound_carried_exits, carries
-from certbound.values.semilagrangian.groundwork import Layout, Plan, layout_of, nodes_of
+from certbound.values.semilagrangian.groundwork import Layout, layout_of, nodes_of
+from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
 from certbound.watch import OutOfTime, poll
@@ -25,8 +28,8 @@ _RARE = 12_000
 _TALLEST = 2500.0
 _SHARE = 1e-3
 _PLANS = (
-    (0.2, (0.7, 0.005, 0.33)), (0.16, (0.6, 0.0035, 0.3)), (0.13, (0.5, 0.0025, 0.25)), (0.1, (0.45, 0.002, 0.22)),
-    (0.08, (0.4, 0.0016, 0.2)),
+    (0.2, (0.7, 0.005, 0.3, 0.06)), (0.16, (0.6, 0.0035, 0.27, 0.03)), (0.16, (0.6, 0.003, 0.24, 0.015)),
+    (0.13, (0.6, 0.0025, 0.22, 0.01)), (0.1, (0.5, 0.002, 0.22, 0.006)), (0.08, (0.5, 0.0016, 0.2, 0.004)),
 )  # fmt: skip
 """Lengths of the steps, relative to the time in which the flow turns by one radian, and cells, finer and finer.
 
@@ -34,12 +37,13 @@ Shorter steps ask for smaller cells, since every step pays for its interpolation
 """
 _FIRST = 0.25  # share of the work that a first look may take, which tells how rare failing is
 _SPARE = 1e-15
-_RATE = 1_200_000
+_RATE = 900_000
 """Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes."""
 _PREPARED = 20
 _LEAST, _MOST = 8, 2000
+_PACE = 0.15  # the length of a scout's steps, as those of plans
 
-Cells = tuple[float, float, float]
+Cells = tuple[float, float, float, float]
 
 
 def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBounds:
@@ -73,13 +77,13 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
         return bound_carried_exits(problem, seconds=seconds)
     begin = time.process_time()
     setting = setting_of(problem)
-    turn = _turn(setting)
+    turn, scout = _turn(setting), scout_of(setting)
     best, least, failed, done, spare = 1.0, 0.0, None, [], _SPARE
-    chosen = _affordable(setting, turn, _RATE * round(seconds, 1))
+    chosen = _affordable(setting, turn, _RATE * round(seconds, 1), scout)
     for k, (ratio, cells) in enumerate(chosen):
         plan = _plan(setting, turn, ratio, cells, spare)
         try:
-            layout = layout_of(setting, plan)
+            layout = layout_of(setting, plan, scout)
             best = min(best, bound_by_steps(setting, plan, layout))
             if k == len(chosen) - 1:
                 least = bound_by_steps_below(setting, plan, layout)
@@ -102,16 +106,19 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
 
 def _plan(setting: Setting, turn: float, ratio: float, cells: Cells, spare: float) -> Plan:
     count = min(max(_LEAST, math.ceil(setting.horizon / (ratio * turn))), _MOST)
-    return Plan(count=count, fine=cells[0], wide=cells[1], cell=cells[2], spare=min(spare, 0.01 / (_RARE * count)))
+    fine, wide, cell, loss = cells
+    return Plan(count=count, fine=fine, wide=wide, cell=cell, loss=loss, spare=min(spare, 0.01 / (_RARE * count)))
 
 
-def _affordable(setting: Setting, turn: float, work: float) -> list[tuple[float, Cells]]:
+def _affordable(
+    setting: Setting, turn: float, work: float, scout: Scouted | None = None
+) -> list[tuple[float, Cells]]:
     """The finest of the plans whose nodes times steps are at most ``work``, after the coarsest if that costs little."""
     chosen, first = _PLANS[0], math.inf
     for ratio, cells in _PLANS:
         plan = _plan(setting, turn, ratio, cells, _SPARE)
         try:
-            needed = nodes_of(setting, plan) * (2 * plan.count + _PREPARED)  # from above and from below
+            needed = nodes_of(setting, plan, scout) * (2 * plan.count + _PREPARED)  # from above and from below
         except InfeasibleError:  # shorter steps may do
             continue
         first = min(first, needed)
@@ -119,6 +126,23 @@ def _affordable(setting: Setting, turn: float, work: float) -> list[tuple[float,
             break
         chosen = ratio, cells
     return [_PLANS[0], chosen] if chosen != _PLANS[0] and first < _FIRST * work else [chosen]
+
+
+def scout_of(setting: Setting) -> Scouted | None:
+    """Where paths that fail go, roughly; None where that is not found."""
+    model = compile_numpy(setting.tape)
+
+    def drift(p: Array, q: Array) -> Array:
+        return np.moveaxis(np.broadcast_to(model(0.0, p, q), (len(p), 2)), -1, 0)
+
+    def broken(p: Array, q: Array) -> Mask:
+        found = np.zeros(len(p), dtype=bool)
+        for wall in setting.walls:
+            found |= ~wall.safe(wall.sizes(Interval.point(p), Interval.point(q)), np.zeros((1, 1)))
+        return found
+
+    steps = min(max(_LEAST, math.ceil(setting.horizon / (_PACE * _turn(setting)))), _MOST // 8)
+    return scouted(drift, setting.noise, setting.faces, setting.some_starts(), setting.horizon, steps, broken)
 
 
 def bound_by_steps(setting: Setting, plan: Plan, layout: Layout | None = None) -> float:

@@ -14,8 +14,9 @@ function inside, it is counted at most once (where this does not rise with d, it
 The inside is looked at within a window of y that a path may cross in a step. The drift is bounded within w standard
 deviations of the face; a share of at most 6 Phi(-w) of the paths comes farther or leaves the window (after the turn of
 the drift, which e^{rate d} is: 6 Phi(-(w - 2 gamma sqrt(h)/s))), which a factor makes up for. From above e^{rate d} is
-cut off at `_MOST`, and what is lost beyond the last node before is made up for as well. Where all this is too much, 2
-is put from gamma h before the face on: the noise of the rest points outward with probability at least 1/2.
+cut off at `_MOST`, and what is lost beyond the last node before is made up for as well. Where that is too much for what
+is beyond alone, the inside is not looked at (m = 0): then all that is counted makes up for it. Where this is too much,
+too, 1/Phi(-gamma sqrt(h)/s) stands beyond the face: the noise of the rest outweighs the drift that often.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from certbound.values.semilagrangian.local_steps import Blocks, Clock
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.remainders import upper_tail
 
-_WIDE = ((3.5, 0.015), (4.25, 0.025), (5.0, 0.08))  # and the share that a factor may make up for
+_WIDE = ((3.5, 0.015), (4.25, 0.025), (5.0, 0.08), (6.0, 0.15))  # and the share that a factor may make up for
+_BLIND = 0.75  # the same where the inside is not looked at, and e^{rate d} is cut off, like levels, at `_MOST`/10
 _MOST = 2000.0
 _SPARED = 8e-3  # more than 6 times (1 + e) Phi(-3.5)
 _UP = 1 + 1e-9
@@ -53,7 +55,9 @@ class Mirror:
     places : ndarray of int, shape (P,)
         All nodes beyond; what has no image inside takes the value of the last that has.
     rate, factor : ndarray, shape (ny,)
-        On every line of y; the rate is nan where nothing is asked or known, where the inside is not looked at.
+        On every line of y; the rate is nan where nothing is asked or known.
+    blind : ndarray of bool, shape (ny,)
+        Lines on which the inside is not looked at.
     window : (ndarray of int, ndarray of int), shapes (ny,)
         First and last line (excluded) that a path may come to.
     """
@@ -64,6 +68,7 @@ class Mirror:
     places: Index
     rate: Array
     factor: Array
+    blind: Mask
     window: tuple[Index, Index]
 
     def above(self, nodal: Array, bend: Array, dq: Array) -> Array:
@@ -71,8 +76,10 @@ class Mirror:
         value = self._inside(nodal, bend, dq, sign=-1.0)
         least = np.minimum.accumulate(self._extreme(value, np.minimum), axis=1)
         share = 1 - np.clip(least - _SLACK, 0.0, 1.0)  # beyond, never less than 1: else a larger drift might count less
+        share = np.where(self.blind[:, None], 1.0, share)
         rate = np.nan_to_num(self.rate)[:, None]
-        power = np.exp(np.minimum(rate * self.depths, math.log(_MOST)) * _UP)
+        highest = np.log(np.where(self.blind, _MOST / 10, _MOST))[:, None]
+        power = np.exp(np.minimum(rate * self.depths, highest) * _UP)
         power = np.where(np.isnan(self.rate)[:, None], 0.0, power)
         return self._all((1 + power * share) * self.factor[:, None])
 
@@ -134,29 +141,33 @@ def mirrors_of(
     for side, end in enumerate(setting.faces[1]):
         drift = _met(clock, blocks, usable, y, (side, end))
         faces = [_face(setting, clock, y, (side, end), wide) for wide, _ in _WIDE]
-        window = np.maximum.reduce([face.window for face in faces])
         inside, beyond = _pairs(q, end, side)
         places = np.arange(beyond[0], len(q) if side else -1, 1 if side else -1)
         depths = np.abs(q[beyond] - end)
         rates, factors = np.full((2, len(y)), np.nan), np.ones((2, len(y)))
+        blind, window = np.zeros(len(y), dtype=bool), faces[-1].window.copy()
         for line in np.flatnonzero(np.isfinite(drift)):
             most = [float(face.inward.hi[line]) for face in faces]
-            options = (_paid(most[k], setting.noise, clock.step, depths, _WIDE[k]) for k in range(len(_WIDE)))
-            found = next((option for option in options if option), None)
+            options = (
+                (k, unseen, _paid(most[k], setting.noise, clock.step, depths, _WIDE[k], blind=unseen))
+                for unseen in (False, True) for k in range(len(_WIDE))
+            )  # fmt: skip
+            k, unseen, found = next((option for option in options if option[-1]), (0, False, None))
             if found is None:
-                margin = max(min(most[-1], float(drift[line])), 0.0) * clock.step * _UP
-                levels[line, _from(q, end, side, margin)] = TWICE
+                margin, level = _levelled([*most, float(drift[line])], setting.noise, clock.step)
+                levels[line, _from(q, end, side, margin)] = level
             else:
-                rates[0, line], factors[0, line] = found
+                (rates[0, line], factors[0, line]), blind[line] = found, unseen
+                window[line] = faces[k].window[line]
             least = float(faces[0].inward.lo[line])
             rates[1, line], factors[1, line] = _granted(least, setting.noise, clock.step, depths)
         mirror = Mirror(
-            inside=inside, beyond=beyond, depths=depths, places=places, rate=rates[0], factor=factors[0],
+            inside=inside, beyond=beyond, depths=depths, places=places, rate=rates[0], factor=factors[0], blind=blind,
             window=_window(y, window),
         )  # fmt: skip
         above.append(mirror)
         if math.isfinite(setting.beyond[1][side]):
-            below.append(replace(mirror, rate=rates[1], factor=factors[1]))
+            below.append(replace(mirror, rate=rates[1], factor=factors[1], window=_window(y, faces[0].window)))
     return above, below, levels
 
 
@@ -189,7 +200,7 @@ def _from(q: Array, face: float, side: int, margin: float) -> slice:
 
 
 def _paid(
-    inward: float, s: float, step: float, depths: Array, wide: tuple[float, float]
+    inward: float, s: float, step: float, depths: Array, wide: tuple[float, float], *, blind: bool = False
 ) -> tuple[float, float] | None:
     """The rate, and the factor that makes up for what is lost; None where that is too much."""
     inward = max(inward, 0.0)
@@ -197,11 +208,24 @@ def _paid(
     turn = inward * math.sqrt(step) / s * _UP
     if not math.isfinite(rate):
         return None
-    last = float(depths[rate * depths <= math.log(_MOST)][-1])
+    last = float(depths[rate * depths <= math.log(_MOST / 10 if blind else _MOST)][-1])
     lost = 6 * upper_tail(wide[0]) + 6 * upper_tail(wide[0] - 2 * turn)
     lost += upper_tail(last / (s * math.sqrt(step)) - turn)
+    if blind:
+        return (rate, _UP / (1 - lost)) if lost < _BLIND else None
     lost /= upper_tail(turn) / _UP**2  # only what is beyond makes up for it, and that counts at least P(d >= 0)
     return (rate, _UP / (1 - lost)) if lost < wide[1] else None
+
+
+def _levelled(inward: list[float], s: float, step: float) -> tuple[float, float]:
+    """A level, and from how far before the face on, for drifts that hold within `_WIDE`, and (the last) always."""
+    best = 0.0
+    for drift, wide in zip(inward, [*(wide for wide, _ in _WIDE), 38.0]):
+        beyond = upper_tail(max(drift, 0.0) * math.sqrt(step) / s * _UP) / _UP**2
+        best = max(best, beyond - 6 * upper_tail(wide))
+    if best * _MOST / 10 > 1:
+        return 0.0, _UP / best
+    return max(min(inward[-2:]), 0.0) * step * _UP, TWICE
 
 
 def _granted(inward: float, s: float, step: float, depths: Array) -> tuple[float, float]:

@@ -14,9 +14,10 @@ v_i(t) |e|^2, so E[zeta_i(t)^2 | e] <= v_i(t) (1 + |e|^2) and, with I_i = (sqrt(
 v_i(t) <= int_0^t (|b|_i + s g_i)^2 ds with g = N e^{N h} |b|, since |e^{N s} b| <= |b| + s N e^{N h} |b|.
 
 *The chord.* For dp = F dt the path's distance from the chord between its ends is int G(t, u) dF_u with Green's function
-G of the step. Where F_q is a constant a, the drift part of dF contributes at most h^2/8 of its supremum and the noise
-part s |a| h^{3/2} times sup_t |t int B - int_0^t B| on the unit interval (`chord_level`). Elsewhere the distance is
-t (1 - t/h) times the difference of two means of F, at most h/4 of F's oscillation over the tube.
+G of the step. Where F_q is a constant a, the drift part of dF contributes at most t (h - t)/2 of its supremum, which is
+at most h^2/8, and the noise part s |a| h^{3/2} k(t/h), k(t) = int min(t, u)(1 - max(t, u)) dB_u on the unit interval
+(`bowed`). Elsewhere the distance is t (1 - t/h) times the difference of two means of F, at most h/4 of F's oscillation
+over the tube.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from certbound.values.discrete import evaluate
 from certbound.values.semilagrangian.flows import reachable
 
 _UP = 1 + 1e-9
-_PARTS = 256
+_PARTS = 400
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -44,8 +45,8 @@ class Remainders:
     ----------
     most, mean : ndarray, shape (2, N)
         r and rho.
-    dip : ndarray, shape (2, N)
-        How far p may be below (above) the chord between its ends, on E and the chord's event.
+    dip, bow : ndarray, shapes (2, N), (N,)
+        How far p may be below (above) the chord between its ends, on E, but for the noise's part: that is ``bow`` k.
     inward : ndarray, shape (2, N)
         Largest drift of q upwards (downwards) on the tube.
     tube : (Interval, Interval)
@@ -57,6 +58,7 @@ class Remainders:
     most: Array
     mean: Array
     dip: Array
+    bow: Array
     inward: Array
     tube: tuple[Interval, Interval]
     known: Mask
@@ -76,23 +78,33 @@ def level_of(probability: float) -> float:
     return high
 
 
-def chord_level(probability: float, omega: float) -> float:
-    """A c with P(sup_t |t int_0^1 B - int_0^t B| > c, sup |B| <= omega) <= probability.
+def bowed(near: Array, far: float) -> Array:
+    """Upper bounds of P(k(t) > near (1 - t) + far t for some t), k as in the module; near and far positive.
 
-    At a fixed t the variable is Gaussian of variance t^2 (1 - t)^2/3, and it changes at most at the rate 2 omega.
+    Z = sqrt(3) k/(t (1 - t)) has variance 1 at all t, and Z' the variance 1/(t (1 - t)). It exceeds beta(t) =
+    sqrt(3) (near/t + far/(1 - t)) where beta is least, or crosses it upwards later, or downwards before, as beta is
+    convex. Rice's formula with a slope of beta that only helps: Phi(-min beta) plus int e^{-beta^2/2}/sqrt(t (1 - t))
+    dt/(2 pi), and t = sin^2(a/2) makes that the mean of e^{-beta^2/2}/2 over a in [0, pi].
     """
-    t = np.arange(1, _PARTS) / _PARTS
-    spread = t * (1 - t) / math.sqrt(3)
-    low, high = 0.0, 12.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        total = sum(2 * upper_tail(middle / float(s)) for s in spread)
-        low, high = (middle, high) if total > probability else (low, middle)
-    return (high + omega / _PARTS) * _UP
+    angles = np.linspace(0, np.pi, _PARTS + 1)[1:-1]
+    t = np.sin(angles / 2) ** 2
+    near = np.asarray(near, dtype=float)[..., None]
+    beta = math.sqrt(3) * (near / t + far / (1 - t)) / _UP
+    least = math.sqrt(3) * (np.sqrt(near) + math.sqrt(far)) ** 2 / _UP
+    ends = np.full((*beta.shape[:-1], 1), np.inf)
+    beta = np.concatenate([ends, beta, ends], axis=-1)
+    lower = np.minimum(beta[..., 1:], beta[..., :-1])
+    turn = 1 / (1 + np.sqrt(far / near))  # where beta is least: a mean of near/t and far/(1 - t)
+    angle = 2 * np.arcsin(np.sqrt(turn))
+    holds = np.abs(angle - (np.arange(_PARTS) + 0.5) * np.pi / _PARTS) <= 0.6 * np.pi / _PARTS
+    lower = np.where(holds, least, lower)
+    mean = np.exp(-0.5 * lower**2).mean(axis=-1) / 2
+    tail = np.array([upper_tail(float(z)) for z in least.ravel()]).reshape(mean.shape)
+    return np.asarray(np.minimum(tail + mean, 1.0) * _UP + 1e-300)
 
 
 def remainders(
-    tape: Tape, noise: float, p: Interval, q: Interval, *, step: float, omega: float, chord: float
+    tape: Tape, noise: float, p: Interval, q: Interval, *, step: float, omega: float
 ) -> Remainders:
     """Bound what the linearisation leaves out over one step from every box.
 
@@ -104,8 +116,7 @@ def remainders(
         s; the noise moves q only.
     p, q : Interval, shape (N,)
         Boxes of starts.
-    step, omega, chord : float
-        h, omega, and c of `chord_level`.
+    step, omega : float
     """
     size = p.lo.shape
     way, known = reachable(tape, [p, q], step)
@@ -135,9 +146,9 @@ def remainders(
     spread = gain**2 * step**2 / 2 + gain * rate * step**3 / 3 + rate**2 * step**4 / 12
     root = np.sqrt(spread) + most * math.sqrt(step)
     mean = _through(growth, 0.5 * np.einsum("kijn,in,jn->kn", bends, root, root)) * _UP
-    dip, inward, fine = _strays(tape, first, second, noise, tube, step, chord)
+    dip, bow, inward, fine = _strays(tape, first, second, noise, tube, step)
     return Remainders(
-        most=most, mean=mean, dip=dip, inward=inward, tube=(tube[0], tube[1]), known=known & fine
+        most=most, mean=mean, dip=dip, bow=bow, inward=inward, tube=(tube[0], tube[1]), known=known & fine
     )
 
 
@@ -166,9 +177,9 @@ def _through(matrix: Array, vector: Array) -> Array:
 
 
 def _strays(
-    tape: Tape, first: Tape, second: Tape, noise: float, tube: list[Interval], step: float, chord: float
-) -> tuple[Array, Array, Mask]:
-    """Bounds of the distance of p from its chord, and of q's drift, over the tube."""
+    tape: Tape, first: Tape, second: Tape, noise: float, tube: list[Interval], step: float
+) -> tuple[Array, Array, Array, Mask]:
+    """Bounds of the distance of p from its chord in two parts, and of q's drift, over the tube."""
     inputs = [Interval.point(np.zeros(tube[0].lo.shape)), *tube]
     f, bad, _ = evaluate(tape, inputs)
     a, worse, _ = evaluate(first, inputs)
@@ -180,14 +191,13 @@ def _strays(
 
     slope = safe(a[:, 1])
     drift = safe(a[:, 0]) * safe(f[:, 0]) + slope * safe(f[:, 1]) + safe(c[:, 3]) * (0.5 * noise**2)
-    # the noise's part: constant slope by the chord's law, the rest by (h/4) osc of the integral of its change
     middle = np.abs(slope.mid) + slope.rad
-    reach = noise * step**1.5 * chord * middle
     varying = (c.mag[:, 2] > 0) | (c.mag[:, 3] > 0)
     width = tube[1].hi - tube[1].lo
     crude = step / 4 * (middle * width + safe(a[:, 0]).mag * (tube[0].hi - tube[0].lo))
-    down = np.where(varying, crude, reach + np.maximum(drift.hi, 0.0) * step**2 / 8)
-    over = np.where(varying, crude, reach + np.maximum(-drift.lo, 0.0) * step**2 / 8)
+    down = np.where(varying, crude, np.maximum(drift.hi, 0.0) * step**2 / 8)
+    over = np.where(varying, crude, np.maximum(-drift.lo, 0.0) * step**2 / 8)
+    bow = np.where(varying, 0.0, noise * step**1.5 * middle)
     speed = safe(f[:, 1])
     inward = np.stack([np.maximum(speed.hi, 0.0), np.maximum(-speed.lo, 0.0)])
-    return np.stack([down, over]) * _UP, inward, fine
+    return np.stack([down, over]) * _UP, bow * _UP, inward, fine

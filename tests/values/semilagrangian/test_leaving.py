@@ -16,10 +16,12 @@ import certbound as cb
 from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
 from certbound.safety.engines import values
-from certbound.values.semilagrangian import bound_exits_by_steps, leaving
+from certbound.values.semilagrangian import bound_exits_by_steps, leaving, mirrors
+from certbound.values.semilagrangian.backward import back
 from certbound.values.semilagrangian.confines import Wall
-from certbound.values.semilagrangian.groundwork import Plan, layout_of
+from certbound.values.semilagrangian.groundwork import layout_of, nodes_of
 from certbound.values.semilagrangian.leaving import bound_by_steps, bound_by_steps_below
+from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import setting_of
 from certbound.watch import OutOfTime, Watch
@@ -224,11 +226,9 @@ def test_bad_arguments_are_named() -> None:
 
 def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
     setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
-    turn = leaving._turn(setting)
-    assert leaving._affordable(setting, turn, 1.0) == [leaving._PLANS[0]]
-    first, chosen = leaving._affordable(setting, turn, 1.2e7)
-    assert first == leaving._PLANS[0]
-    assert chosen in leaving._PLANS[1:-1]
+    turn, scout = leaving._turn(setting), leaving.scout_of(setting)
+    assert leaving._affordable(setting, turn, 1.0, scout) == [leaving._PLANS[0]]
+    assert leaving._affordable(setting, turn, 1.7e6, scout)[-1] in leaving._PLANS[1:-1]
 
 
 def test_the_steps_end_when_the_time_is_over() -> None:
@@ -241,8 +241,73 @@ def test_the_steps_end_when_the_time_is_over() -> None:
 def test_beyond_a_face_nobody_counts_less_than_once() -> None:
     mirror = Mirror(
         inside=np.array([2, 1, 0]), beyond=np.array([2, 3, 4]), depths=np.array([0.0, 0.1, 0.2]),
-        places=np.array([2, 3, 4]), rate=np.zeros(1), factor=np.ones(1), window=(np.zeros(1, int), np.ones(1, int)),
+        places=np.array([2, 3, 4]), rate=np.zeros(1), factor=np.ones(1), blind=np.zeros(1, bool),
+        window=(np.zeros(1, int), np.ones(1, int)),
     )  # fmt: skip
     found = mirror.above(np.array([[0.5, 0.9, 1.2, 0.0, 0.0]]), np.zeros((1, 4)), np.full(4, 0.1))
     assert np.allclose(found, [[1.0, 1.1, 1.5]], atol=1e-9)
     assert np.all(found >= 1)
+
+
+@pytest.mark.parametrize("drift", [0.3, 1.4, 1.7, 3.0])
+def test_whoever_met_a_face_counts_once_in_the_mean_where_the_inside_is_not_looked_at(drift) -> None:
+    s, h, depths = 1.0, 1.0, np.linspace(0, 8, 161)
+    found = mirrors._paid(drift, s, h, depths, (6.0, 0.15), blind=True)
+    assert found is not None or drift > 2
+    margin, level = mirrors._levelled([math.inf, drift], s, h)
+    fine = (np.arange(40000) + 0.5) / 5000
+    for left in np.linspace(0.01, h, 12):
+        density = np.exp(-((fine + drift * left) ** 2) / (2 * left)) / math.sqrt(2 * math.pi * left) / 5000
+        assert (density * level).sum() + (ndtr(math.sqrt(left) * drift) if margin else 0.0) >= 1 - 1e-6
+        if found is not None:
+            counted = 1 + np.exp(np.minimum(found[0] * np.interp(fine, depths, depths), math.log(200.0)))
+            assert 1 - 1e-6 <= (density * counted).sum() * found[1] <= 1.1 * found[1]
+
+
+def scouted_problem() -> cb.Problem:
+    return mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 0.4, [0, -2], [2, 2], 1.5, (0.5, -0.1))
+
+
+def test_scouts_say_where_a_grid_must_be_fine() -> None:
+    setting = setting_of(scouted_problem())
+    scout = leaving.scout_of(setting)
+    assert scout is not None
+    assert 0.5 * setting.horizon < scout.visits.sum() <= setting.horizon * (1 + 1e-9)  # paths that fail end early
+    assert (scout.visits * scout.p).sum() < scout.visits.sum()  # they go to the left, where leaving is easy
+    plan = replace(COARSE, count=15, loss=0.01, cell=0.3)
+    assert nodes_of(setting, plan, scout) < 0.6 * nodes_of(setting, plan)
+    calm = setting_of(mechanical(lambda x: -x[0] - x[1], 1e-3, [-5, -5], [5, 5], 0.5, (0.0, 0.0)))
+    assert leaving.scout_of(calm) is None
+
+
+@pytest.mark.slow
+def test_on_a_scouted_grid_the_bounds_hold() -> None:
+    rng, problem = np.random.default_rng(8), scouted_problem()
+    setting = setting_of(problem)
+    plan = replace(COARSE, count=15, loss=0.01, cell=0.3)
+    seeing = layout_of(setting, plan, leaving.scout_of(setting))
+    share, error = simulated(problem, 3_000, rng)
+    upper, lower = bound_by_steps(setting, plan, seeing), bound_by_steps_below(setting, plan, seeing)
+    assert lower - 4 * error < share < upper + 4 * error
+    assert lower < upper < 2.5 * lower
+
+
+def test_who_bows_out_within_a_step_is_counted() -> None:
+    rng = np.random.default_rng(9)
+    problem = mechanical(lambda x: 2.0 + 0 * x[0], 0.5, [0, -2], [2, 2], 0.1, (1.0, 0.0))  # pushed back inside
+    setting, h = setting_of(problem), 0.1
+    layout = layout_of(setting, replace(COARSE, count=1))
+    value = back(layout.frame, layout.bands, layout.above, leaving.terminal(layout, layout.above))
+    bow = 0.5 * h**1.5
+    for p, q in ((0.4 * bow, 0.0), (0.8 * bow, 0.0), (1.5 * bow, -0.1), (0.6 * bow, 0.1), (5 * bow, -0.6)):
+        paths, parts = 4000, 200
+        x, v, least = np.full(paths, p), np.full(paths, q), np.full(paths, p)
+        for _ in range(parts):
+            kick = setting.noise * math.sqrt(h / parts) * rng.standard_normal(paths)
+            x, v = x + h / parts * (v + kick / 2), v + 2.0 * h / parts + kick
+            least = np.minimum(least, x)
+        seen = (least < 0).mean()
+        y = p - layout.clock.shear * q
+        i, j = np.searchsorted(layout.frame.y, y) - 1, np.searchsorted(layout.frame.q, q, side="right") - 1
+        most = value.nodal[i : i + 2, j : j + 2].max() + np.abs(value.bend[i : i + 2, j]).max() / 8 * 0.1**2
+        assert most >= seen - 4 * math.sqrt(seen * (1 - seen) / paths)

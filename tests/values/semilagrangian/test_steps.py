@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -16,12 +17,14 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import KAPPA
+from certbound.values.semilagrangian import bands
 from certbound.values.semilagrangian.backward import Bounds, back, limited
 from certbound.values.semilagrangian.bands import Band, Frame, through
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
-from certbound.values.semilagrangian.groundwork import Plan, layout_of
+from certbound.values.semilagrangian.groundwork import layout_of
+from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import serves, setting_of
-from certbound.values.semilagrangian.remainders import chord_level, level_of, remainders, upper_tail
+from certbound.values.semilagrangian.remainders import bowed, level_of, remainders, upper_tail
 from certbound.values.semilagrangian.smoothers import WIDER, across, along
 from certbound.values.semilagrangian.smoothing import Lines, smoothed
 
@@ -65,7 +68,7 @@ def test_a_step_too_long_to_be_enclosed_is_not_known() -> None:
 def test_linear_models_leave_no_remainder() -> None:
     setting = setting_of(mechanical(lambda x: -x[0] - x[1], 0.4, [-1, -2], [1, 2]))
     box = Interval(np.array([-0.5]), np.array([0.5]))
-    found = remainders(setting.tape, 0.4, box, box, step=0.1, omega=5.0, chord=1.0)
+    found = remainders(setting.tape, 0.4, box, box, step=0.1, omega=5.0)
     assert found.known.all()
     assert not np.any([found.most, found.mean])
 
@@ -74,7 +77,7 @@ def test_remainder_and_dip_bound_what_simulated_paths_do(rng) -> None:
     setting = setting_of(mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1] * x[1], 0.5, [0, -2], [2, 2]))
     h, omega = 0.1, level_of(1e-6)
     point = Interval.point(np.array([1.2])), Interval.point(np.array([-0.5]))
-    bound = remainders(setting.tape, 0.5, *point, step=h, omega=omega, chord=chord_level(1e-6, omega))
+    bound = remainders(setting.tape, 0.5, *point, step=h, omega=omega)
     assert bound.known.all()
     count, parts = 4000, 100
     d = h / parts
@@ -93,17 +96,18 @@ def test_remainder_and_dip_bound_what_simulated_paths_do(rng) -> None:
         assert np.abs(left).mean() > mean / 60
     time = np.linspace(0, 1, parts + 1)[:, None]
     below = ((1 - time) * path[0] + time * path[-1] - np.array(path)).max()
-    assert 0.2 * bound.dip[0, 0] < below <= bound.dip[0, 0]
+    assert 0.2 * bound.bow[0] < below <= bound.dip[0, 0] + 1.5 * bound.bow[0]
 
 
 def test_levels_of_rare_events(rng) -> None:
     assert 4 * upper_tail(level_of(1e-9)) <= 1e-9 <= 4 * upper_tail(level_of(1e-9) * 0.999)
-    walk = np.cumsum(rng.standard_normal((4000, 400)), axis=1) / 20
+    walk = np.cumsum(rng.standard_normal((8000, 400)), axis=1) / 20
     time = np.arange(1, 401) / 400
-    swing = np.abs(time * walk.mean(axis=1, keepdims=True) - np.cumsum(walk, axis=1) / 400).max(axis=1)
-    level = chord_level(0.01, 4.0)
-    assert (swing > level).mean() < 0.01
-    assert (swing > level / 2).any()
+    bow = time * walk.mean(axis=1, keepdims=True) - np.cumsum(walk, axis=1) / 400
+    for near, far in ((0.1, 0.1), (0.3, 0.3), (0.5, 0.2), (1.0, 0.1)):
+        seen, bound = (bow > near * (1 - time) + far * time).any(axis=1).mean(), bowed(np.array([near]), far)[0]
+        assert seen - 3 * math.sqrt(seen / 8000) <= bound <= 1.6 * seen + 3 * math.sqrt(bound / 8000)
+    assert (np.diff(bowed(np.array([0.3, 0.4, 2.0, 30.0]), 0.3)) < 0).all()
 
 
 Y = np.concatenate([[-1.0, -0.7, -0.5], np.linspace(-0.4, 0.6, 41), [0.7, 0.9, 1.2]])
@@ -241,6 +245,18 @@ def test_kernels_that_are_off_change_a_step_by_less_than_what_is_paid_for_roundi
         assert np.all(change[band.live] <= room[band.live])
         shares.append(float((change[band.live] / room[band.live]).max()))
     assert max(shares) > 1e-6  # it is not paid a million times
+
+
+def test_rounding_sees_the_lines_that_are_near(rng) -> None:
+    lines, mesh = (np.cumsum(rng.uniform(0.01, 1.0, size)) for size in (60, 50))
+    image, more = rng.uniform(3, 24, (4, 5)), rng.uniform(0, 2, (3, 4))
+    least, ratio = bands._nearby(image, more, lines, mesh, 1.0)
+    for i, j in itertools.product(range(3), range(4)):
+        corners = image[i : i + 2, j : j + 2]
+        ends = corners.min() - more[i, j] - 1.0, corners.max() + more[i, j] + 1.0
+        met = [np.diff(x)[(x[1:] > ends[0]) & (x[:-1] < ends[1])] for x in (lines, mesh)]
+        assert least[i, j] <= met[0].min()
+        assert ratio[i, j] * least[i, j] >= met[1].max() * (1 - 1e-12)
 
 
 def test_every_cell_of_a_band_has_the_variance_of_its_own_step(rng) -> None:
