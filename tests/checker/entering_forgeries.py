@@ -17,7 +17,7 @@ from tests.checker.conftest import side_of
 from tests.checker.forgeries import _BASES, Data, _sharp, forges, repacked
 from tests.checker.value_forgeries import LESS, MORE
 
-_FILE = "values/entering.py"
+_FILE = "values/reaching/entering.py"
 RATE, STEEP, INSIDE, BENT = 1.0, 20.0, 0.3, 0.5
 
 
@@ -91,7 +91,7 @@ def _meeting(*, lower: bool) -> Callable[[], str]:
                 upper=0.0, lower=payment.log / log10, words="", seconds=0.0, proposed_below=((surface, payment),)
             )
         else:
-            surface, payment = targets._proved_above(_bowl(1.2), aim)
+            surface, payment = targets.prove_failing_above(_bowl(1.2), aim)
             found = ExitBounds(
                 upper=payment.log / log10, lower=None, words="", seconds=0.0, proposed=((surface, payment),)
             )
