@@ -11,7 +11,13 @@ import pytest
 
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
-from tests.checker import goal_forgeries, lasting_forgeries, turned_forgeries, value_forgeries  # noqa: F401  # they enter themselves
+from tests.checker import (  # noqa: F401  # they enter themselves
+    entering_forgeries,
+    goal_forgeries,
+    lasting_forgeries,
+    turned_forgeries,
+    value_forgeries,
+)
 from tests.checker.forgeries import FORGERIES, forged, text
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "certificate.md"

@@ -15,10 +15,10 @@ from certbound.checker.statement import Model, StepSet, cells_of, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Array, above, terms
 from certbound.checker.values.crossing import Crossing
-from certbound.checker.values.entering import bound_failing_above, bound_failing_below
 from certbound.checker.values.normal_means import axis_table, mean_table
 from certbound.checker.values.passage import Passage
 from certbound.checker.values.piece_means import PieceTransition, pieces_of
+from certbound.checker.values.reaching import bound_failing_above, bound_failing_below
 from certbound.checker.values.step_back import (
     DEGREE,
     Grid,

@@ -6,6 +6,7 @@ Those of discrete time: ``step_values``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +31,8 @@ from certbound.values.chains import Drifting
 from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, SureExit, Surface, bound_lasting
 from certbound.values.discrete import FailureBounds
 
+Proposed = tuple[Surface, Payment]
+
 _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
 _MORE_ROOM = 3  # in continuous time and two states
 _MORE = 1.02  # of lam, which the checker need not prove
@@ -48,7 +51,7 @@ def values_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     """
     if isinstance(answer.details, FailureBounds):
         return induction_proof(problem, answer, attempt)
-    if problem.ending:
+    if problem.ending and not isinstance(answer.details, ExitBounds):  # that counts leaving the domain as failing
         raise CertificateError("the checker counts leaving the domain as failing, and this bound does not.")
     if isinstance(answer.details, Lasting):
         return _lasting(problem, attempt, above=True)
@@ -145,7 +148,7 @@ def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]
             "curved limits."
         )
     if problem.reach is not None:
-        return _entered(problem, *found.proposed[-1], lower=False)
+        return _entered(problem, *_enough(problem, found.proposed, effort), lower=False)
     best = min(payment.log for _, payment in found.proposed)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
     surface, payment = next(pair for pair in found.proposed if pair[1].log <= best + share)
@@ -157,7 +160,7 @@ def _crossing(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any
     if not found.proposed_below:
         raise CertificateError("no value function was found that the checker knows, from below.")
     if problem.reach is not None:
-        return _entered(problem, *found.proposed_below[-1], lower=True)
+        return _entered(problem, *_enough(problem, found.proposed_below, effort), lower=True)
     best = max(payment.log for _, payment in found.proposed_below)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
     surface, payment = next(pair for pair in found.proposed_below if pair[1].log >= best - share)
@@ -166,6 +169,14 @@ def _crossing(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any
     if not problem.initial.random:
         data["starts"] = exact(some_starts(problem))
     return data
+
+
+def _enough(problem: Problem, pairs: Sequence[Proposed], effort: int) -> Proposed:
+    """The coarsest value function of a target whose bound is about that of the last one, the best."""
+    arriving = problem.system.dimension == 1
+    levels = [math.log(-math.expm1(one.log)) if arriving else one.log for _, one in pairs]
+    share = _COARSE[effort] * max(1.0, -0.1 * levels[-1])
+    return next(pair for pair, level in zip(pairs, levels) if abs(level - levels[-1]) <= share)
 
 
 def _entered(problem: Problem, surface: Surface, payment: Payment, *, lower: bool) -> dict[str, Any]:

@@ -119,13 +119,8 @@ class _Aim:
     points: Array | None
 
 
-def prove_failing_above(surface: Surface, aim: _Aim) -> Payment:
-    """An upper bound of log P(failing), whatever the surface is."""
-    return _proved_above(surface, aim)[1]
-
-
-def _proved_above(surface: Surface, aim: _Aim) -> Proposed:
-    """The same, and the surface, raised by what it misses."""
+def prove_failing_above(surface: Surface, aim: _Aim) -> Proposed:
+    """The surface, raised by what it misses, and an upper bound of log P(failing), whatever it is."""
     fate = Fate.of(surface.axes, aim.target)
     if not fate.beside.any():
         return surface, Payment(log=0.0)
@@ -258,7 +253,7 @@ def bound_failing(
         with contextlib.suppress(OutOfTime):
             surface = _promising(aims[0], plan)
             if surface is not None:
-                found = _proved_above(surface, aims[0])
+                found = prove_failing_above(surface, aims[0])
                 above += [found] if found[1].log < upper else []
                 upper = min(upper, found[1].log)
             surface = _promising(aims[1], plan)

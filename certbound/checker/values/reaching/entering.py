@@ -4,8 +4,8 @@
 one of whose sides lies in the target, the proof from below (`crossing`) bounds the probability of leaving by that side
 within the target's window, from every start: these paths have arrived. On an interval that keeps off the target, and
 whose starts are some of the initial set, the proof from above (`passage`) bounds that of leaving by a side that does
-not break a constraint: no other path arrives, as paths are continuous. With P the probability of arriving, 1 - P is that
-of failing.
+not break a constraint: no other path arrives, as paths are continuous. With P the probability of arriving, 1 - P is
+that of failing.
 
 *Two states*: V is about log of the probability of failing. Above, cells of the grid that lie in the target are over;
 their union is a part of the target, so that to miss it is no less probable. V >= 0 on the other cells at the end of the
