@@ -68,7 +68,7 @@ class Ramps:
         own = [[csr_matrix(table) for table in one.dense] for one in self.splines]
 
         def part(weight: Array, i: int, j: int) -> csr_matrix:
-            return diags(weight.ravel()) @ kron(own[0][i], own[1][j], format="csr")
+            return csr_matrix(diags(weight.ravel()) @ kron(own[0][i], own[1][j]))
 
         self.mass = kron(own[0][0], own[1][0], format="csr")
         self.operator = part((1 - on[0]) * force[0], 1, 0) + part((1 - on[1]) * force[1], 0, 1)
@@ -104,7 +104,7 @@ class Ramps:
     def _step(self, value: Array, step: float, fed: Array, ages: Array) -> Array:
         """U at the three stages: the faces first, which do not depend on what is inside."""
         edge = self.edge
-        right = np.outer(_INVERSE.sum(axis=1) / step, self.mass @ value) + fed
+        right = np.outer(_INVERSE.sum(axis=1) / step, np.asarray(self.mass @ value)) + fed
         x = ages / self.lead
         fall = _RATE * x * x / (1 + x**3) / self.lead
         own, moved = self.mass[edge][:, edge], self.operator[edge][:, edge]
