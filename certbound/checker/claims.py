@@ -180,7 +180,7 @@ def _is_whole(model: Model, proof: object) -> bool:
     engine = proof.get("engine") if isinstance(proof, Mapping) else None
     if model.stays:
         return engine == "values" and not model.continuous
-    return engine == "values" or engine in WHOLE
+    return engine in WHOLE or (engine == "values" and not (model.continuous and math.isinf(model.horizon)))
 
 
 def _cells(
