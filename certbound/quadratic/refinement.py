@@ -294,8 +294,7 @@ class Search:
         hopes = {PIECES: _HOPE, SPLIT: _HOPE} | self._slabs(attempt)
         if not attempt.level < 0:  # windows are no cure, and pieces seldom
             hopes = {PIECES: _HOPE / 3} | self._slabs(attempt)
-        left, found = until - time.perf_counter(), []
-        entries = math.comb(self.setting.dimension + 2, 2)
+        left, found, entries = until - time.perf_counter(), [], math.comb(self.setting.dimension + 2, 2)
         if attempt.others and attempt.gains.get(APART, math.inf) > 0:
             many = _SINGLE * len(attempt.finer(APART)) * attempt.seconds
             hopes = {APART if many < left or not attempt.paired else PAIRS: 1.0}

@@ -385,7 +385,7 @@ def test_remainders_do_not_depend_on_the_units_of_the_states() -> None:
         tape = setting_of(asked.replace(system=system)).tape
         ends = [np.array([low]) for low in (0.25, 0.5)]
         p, q = (Interval(low, low + 0.125) for low in ends)
-        found = remainders(tape, 0.5, p * factor, q, step=0.25, omega=8.0, chord=4.0)
+        found = remainders(tape, 0.5, p * factor, q, step=0.25, omega=8.0)
         assert found.known.all()
         kept.append(np.concatenate([found.most[:, 0], found.mean[:, 0]]) / np.tile([factor, 1.0], 2))
     assert np.allclose(kept[0], kept[1], rtol=0.02)
