@@ -50,7 +50,7 @@ _ENOUGH = 0.25  # and nothing else is tried
 
 def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wanted: float) -> Found:
     """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
-    granted, starts = deadline - time.perf_counter(), starts_of(problem)
+    granted, starts = round(deadline - time.perf_counter(), 1), starts_of(problem)
     inner = plane_of(problem, model, room.inner_low, room.inner_high, starts)
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
     if not served or held_plane(inner, model)[0] is not inner:
