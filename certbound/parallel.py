@@ -190,7 +190,8 @@ class _Servants:
 
     def finished(self) -> list[tuple[Any, Answer]]:
         at_work = [pipe for pipe, keys in self._given.items() if keys]
-        return [(self._given[pipe].popleft(), _received(pipe)) for pipe in wait(at_work, _LOOK)]  # type: ignore[index,arg-type]
+        ready: list[Any] = wait(at_work, _LOOK)
+        return [(self._given[pipe].popleft(), _received(pipe)) for pipe in ready]
 
     def close(self) -> None:
         _ended(self._processes.items())

@@ -6,7 +6,9 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from numpy.polynomial import Chebyshev
 
+import certbound as cb
 from certbound.values.continuous.line import stationary
 
 
@@ -47,3 +49,26 @@ def test_derivatives_are_the_exact_ones() -> None:
             Fraction(y + float(h)) - Fraction(y - float(h))
         )
         assert abs(float(middle - exactly(once, y))) < 1e-9
+
+
+def test_ranges_over_cells_hold_between_the_middles() -> None:
+    """m, and L m = -x^3 m' + .08 m'', of a polynomial of degree 12 that is worked out anew at places in each cell."""
+    problem = cb.Problem(
+        cb.ContinuousSystem(lambda x: -(x**3), states=1, diffusion=0.4),
+        initial=[0],
+        safe=[cb.Inside(cb.Box([-2], [1]))],
+        horizon=1,
+    )
+    square = stationary._square(problem)
+    assert square is not None
+    cells = stationary._Cells(problem, square, -2.0, 1.0, 32)
+    m = Chebyshev(np.random.default_rng(4).standard_normal(13), domain=[-2, 1])
+    x = -2 + 3 * (np.arange(32)[:, None] + np.linspace(0, 1, 21)) / 32
+    for found, exact in (
+        (cells.values(m.coef), m(x)),
+        (cells.moved(m.coef), -(x**3) * m.deriv(1)(x) + 0.08 * m.deriv(2)(x)),
+    ):
+        near = 1e-9 * np.abs(exact).max()
+        assert np.all(found.lo <= exact.min(axis=1) + near)
+        assert np.all(exact.max(axis=1) <= found.hi + near)
+        assert np.all(found.hi - found.lo < 20 * np.ptp(exact, axis=1).max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
 from certbound.display import log10_text
+from certbound.errors import EngineError
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import answer_tubes
 from certbound.reach.linear.answer_tubes import DeviationTube
@@ -183,7 +185,16 @@ class SplitAnswer(LinearAnswer):
 
     @classmethod
     def of(cls, cells: list[tuple[Path, Array, Array, LinearAnswer]]) -> SplitAnswer:
-        """Of the cells' paths, ends and answers, sorted by path."""
+        """Of the cells' paths, ends and answers, sorted by path.
+
+        Raises
+        ------
+        EngineError
+            A part of the initial set lies in no cell: whatever interrupted the search, nothing is proved of that.
+        """
+        paths = {path for path, _, _, _ in cells}
+        if len(paths) < len(cells) or sum(Fraction(1, 2 ** len(path)) for path in paths) != 1:
+            raise EngineError("the cells of the initial set do not cover it.")
         parts = tuple(part for _, _, _, part in cells)
         worst = max(parts, key=lambda part: part.outcome.log_probability)
         return cls(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.errors import EngineError
 from certbound.reach.linear import SplitAnswer, bisection
 from certbound.reach.linear.answer import linear_answer
 from certbound.watch import OutOfTime
@@ -43,6 +44,14 @@ def test_unequal_cells_cover_the_starts_and_meet_the_target(split: SplitAnswer) 
     np.testing.assert_array_equal(low[1:], high[:-1])
     assert len({round(width, 9) for width in high - low}) > 1
     assert split.outcome.log_probability == max(part.outcome.log_probability for part in split.parts)
+
+
+def test_a_cell_that_was_lost_on_the_way_is_missed(split: SplitAnswer) -> None:
+    cells = list(zip(split.paths, split.low, split.high, split.parts))
+    assert SplitAnswer.of(cells).outcome is split.outcome
+    for wrong in (cells[1:], [*cells[1:], cells[1]]):
+        with pytest.raises(EngineError, match="do not cover"):
+            SplitAnswer.of(wrong)
 
 
 def test_less_is_proved_than_on_one_cell_and_than_on_as_many_equal_ones(split: SplitAnswer) -> None:

@@ -311,3 +311,23 @@ def test_who_bows_out_within_a_step_is_counted() -> None:
         i, j = np.searchsorted(layout.frame.y, y) - 1, np.searchsorted(layout.frame.q, q, side="right") - 1
         most = value.nodal[i : i + 2, j : j + 2].max() + np.abs(value.bend[i : i + 2, j]).max() / 8 * 0.1**2
         assert most >= seen - 4 * math.sqrt(seen * (1 - seen) / paths)
+
+
+def test_cells_beside_a_face_pay_for_paths_that_leave_and_come_back_within_a_step() -> None:
+    """dp = v dt, dv = s dW: from a cell's end towards the face, at speeds that lead back or along it."""
+    s, plan, rng = 0.8, replace(COARSE, count=4, cell=0.8), np.random.default_rng(7)
+    setting = setting_of(mechanical(lambda x: 0.0 * x[0], s, [-1, -3], [1, 3], 1.0, (0.0, 0.0)))
+    layout = layout_of(setting, plan)
+    h, paid = layout.clock.step, layout.above.paid
+    short = 0.3 * s * h**1.5  # who ends nearer to the face than that is counted as having left
+    y, q, shear = layout.frame.y, layout.frame.q, layout.clock.shear
+    away = 1 - (y[1:, None] + shear * q[None, 1:])
+    count, steps, seen = 5000, 100, 0.0
+    for row, column in np.argwhere(layout.frame.live & (away >= short) & (away < 1.5 * short) & (np.abs(q[1:]) < 1)):
+        for speed in np.linspace(q[column], q[column + 1], 4)[1:]:
+            noise = np.cumsum(s * math.sqrt(h / steps) * rng.standard_normal((count, steps)), axis=1)
+            p = y[row + 1] + shear * speed + np.cumsum(speed + noise, axis=1) * (h / steps)
+            found = ((p.max(axis=1) > 1) & (p[:, -1] < 1 - short)).mean()
+            assert found <= paid[row, column]
+            seen = max(seen, found)
+    assert seen > 5e-4

@@ -46,6 +46,8 @@ def closed_plane(problem: Problem, model: Model, room: Room) -> Room:
 
     A state without noise ends where the drift leads back all along, if it does so near by: no path leaves there.
     """
+    if np.isfinite([*room.inner_low, *room.inner_high]).all():
+        return room
     drift, square = floats_of(model)
     reach = reach_of(problem, drift, square, _BEYOND)
     inner = [np.array(room.inner_low), np.array(room.inner_high)]

@@ -80,7 +80,6 @@ def two_states(
     """
     starts = starts_of(problem)
     plain, rare = model, -math.inf
-    limited = bool(np.isfinite([*room.inner_low, *room.inner_high]).all())
     room = closed_plane(problem, model, room)
     inner, model = held_plane(plane_of(problem, model, room.inner_low, room.inner_high, starts), model)
     if led(model):
@@ -93,13 +92,13 @@ def two_states(
         inner = near if rough_level(near) < rough_level(inner) + _ALIKE else inner
     else:
         check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
-        if wanted < math.inf and limited:
+        if wanted < math.inf:
             check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     level = rough_level(inner)
     upper, done, proposed = bound_plane_above(inner, model, level, patches, rare)
     below: list[Proposed] = []
-    if upper > wanted and limited and not held_anywhere(inner):
+    if upper > wanted and not held_anywhere(inner):
         outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
         plan = plan_below(outer, min(level, upper), BELOW * patches)
         with contextlib.suppress(OutOfTime):
