@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.errors import InfeasibleError
 from certbound.values.continuous import exits, straight
+from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import Model, prove_lower, prove_upper
 from certbound.values.continuous.plane import Plane, plane_of
 from certbound.values.continuous.room import safe_room, starts_of
@@ -47,6 +49,41 @@ def test_both_bounds_are_near_the_truth_and_hold_on_spoilt_proposals() -> None:
     assert prove_upper(spoilt[0].raised(-1e-3), model, inner.starts).log >= truth
     payment = prove_lower(spoilt[1].raised(1e-3), model, inner.starts)
     assert payment is None or payment.log <= truth
+
+
+def test_noises_that_go_together_have_both_bounds() -> None:
+    """Without a margin no lower bound is found: second derivatives grow without limit in two of the corners."""
+    gain = 0.6 * np.array([[1, 0], [0.7, math.sqrt(0.51)]])
+    system = cb.ContinuousSystem(lambda x: [0 * x[0], 0 * x[1]], states=2, diffusion=gain)
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
+    inner, model = plane(problem)
+    above = near_one._bounded(inner, model, 12, None, below=False)
+    below = near_one._bounded(inner, model, 12, None, below=True)
+    assert above is not None
+    assert below is not None
+    odd = 2 * np.arange(30) + 1.0
+    stays = 4 / np.pi * float(np.sum((-1.0) ** np.arange(30) / odd * np.exp(-((0.6 * np.pi * odd) ** 2) / 8)))
+    assert above[1].log > math.log(1 - stays)  # of one of them
+    assert below[1].log < math.log(1 - stays**2)  # of two that go apart
+    assert above[1].log - below[1].log < 0.7
+    assert [one.axes[0][-1] for one, _ in (above, below)] == [1.0, 1.0]
+
+
+def test_noise_that_is_small_beside_a_face_has_full_rank() -> None:
+    """A price and its volatility: a's determinant, .09 v^2 (1 - .49), over cells that are wide beside v = .005."""
+
+    def model(low: float) -> Model:
+        system = cb.ContinuousSystem(
+            lambda x: [-x[1] / 2, 2 * (0.04 - x[1])],
+            states=2,
+            diffusion=lambda x: [[x[1] ** 0.5, 0 * x[1]], [-0.21 * x[1] ** 0.5, 0.214 * x[1] ** 0.5]],
+        )
+        box = cb.Inside(cb.Box([-0.4, low], [0.7, 0.3]))
+        return exits._model(cb.Problem(system, initial=[0, 0.04], safe=[box], horizon=0.5))
+
+    check_noise(model(0.005), (0.0, 0.5), [(-0.4, 0.7), (0.005, 0.3)])
+    with pytest.raises(InfeasibleError, match="full rank"):
+        check_noise(model(0.0), (0.0, 0.5), [(-0.4, 0.7), (0.0, 0.3)])
 
 
 def test_a_face_that_no_upper_proposal_reaches_is_raised() -> None:

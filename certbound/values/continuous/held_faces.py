@@ -53,6 +53,7 @@ _SCANNED = 2001
 _ALONG = 192  # cells of a slope that varies
 _STEEPEST = 50.0  # what it may rise by over a cell
 _LEVELS = np.geomspace(0.1, 20.0, 8)  # of its rate, over the horizon
+_HALVINGS, _MOST_CELLS = 6, 4096  # of cells where noise of full rank is not seen at once
 _NIL = 1e-13  # of the largest a: what counts as vanishing, for candidates
 
 
@@ -69,19 +70,34 @@ def check_noise(
     """
     fine = [np.linspace(low, high, 17) for low, high in ends]
     fine = [axis[int(sides[0]) : 17 - int(sides[1])] for axis, sides in zip(fine, held or [(False, False)] * len(fine))]
-    low = np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")
-    high = np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")
-    clock = [Interval(*span).broadcast_to((low[0].size,))]
-    values, _ = enclose(model.square.tape, clock + [Interval(a.ravel(), b.ravel()) for a, b in zip(low, high)])
+    low = np.stack(np.meshgrid(*(axis[:-1] for axis in fine), indexing="ij")).reshape(len(fine), -1)
+    high = np.stack(np.meshgrid(*(axis[1:] for axis in fine), indexing="ij")).reshape(len(fine), -1)
+    for _ in range(_HALVINGS):
+        smallest = _least_noise(model, span, low, high)
+        if np.all(smallest > 0):
+            return
+        low, high = low[:, ~(smallest > 0)], high[:, ~(smallest > 0)]
+        if low.shape[1] > _MOST_CELLS:
+            break
+        for axis in range(len(fine)):
+            middle = low[axis] + (high[axis] - low[axis]) / 2
+            low, high = np.hstack([low, low]), np.hstack([high, high])
+            high[axis, : len(middle)], low[axis, len(middle) :] = middle, middle
+    raise InfeasibleError(
+        "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
+        "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
+    )
+
+
+def _least_noise(model: Model, span: Ends, low: Array, high: Array) -> Array:
+    """Positive where a is positive definite on all of a box; boxes of shape (n, N)."""
+    clock = [Interval(*span).broadcast_to(low.shape[1:])]
+    values, _ = enclose(model.square.tape, clock + [Interval(a, b) for a, b in zip(low, high)])
     smallest = values[0].lo
-    if len(fine) == 2:
+    if len(low) == 2:
         cross = np.maximum(np.abs(values[1].lo), np.abs(values[1].hi))
         smallest = np.minimum(np.minimum(values[0].lo, values[3].lo), values[0].lo * values[3].lo - cross**2)
-    if not np.all(smallest > 0):
-        raise InfeasibleError(
-            "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
-            "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
-        )
+    return np.asarray(smallest)
 
 
 def held_face(model: Model, box: Sequence[Ends], inner: Ends, span: Ends, axis: int, side: int) -> float | None:

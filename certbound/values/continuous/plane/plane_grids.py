@@ -64,6 +64,8 @@ class Plan:
 class Source:
     """What V's equation gets in addition, at the nodes of a surface: linear between them in time and in each state.
 
+    Beyond the nodes it is what it is at the last one.
+
     ``values`` has shape (K + 1, N_1 + 1, N_2 + 1, ...), times forward.
     """
 
@@ -94,7 +96,7 @@ class Source:
 
 def _linear(nodes: Array, points: Array) -> Array:
     left = np.clip(np.searchsorted(nodes, points) - 1, 0, len(nodes) - 2)
-    share = (points - nodes[left]) / (nodes[left + 1] - nodes[left])
+    share = np.clip((points - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
     matrix = np.zeros((len(points), len(nodes)))
     matrix[np.arange(len(points)), left] = 1 - share
     matrix[np.arange(len(points)), left + 1] = share

@@ -41,6 +41,7 @@ _COARSE = 0.55  # of the cells that may be afforded, for a first grid
 _COST = 0.01  # about the seconds of both sides, over cells^2
 _SHARE = 0.58  # of what may be spent, for the finer grid
 _LEAD = 6.0  # over cells^2: a ramp's share of the horizon
+_MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noises: lower bounds need more
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
@@ -103,7 +104,8 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
 
 def _bounded(plane: Plane, model: Model, cells: int, points: Array | None, *, below: bool) -> Proposed | None:
     """The best bound of a few proposals: corrected by samples of the residual, then by its bounds."""
-    solver, starts = Ramps(plane, cells, min(_LEAD / cells**2, 0.1) * plane.horizon), plane.starts
+    solver = Ramps(plane, cells, min(_LEAD / cells**2, 0.1) * plane.horizon, _MARGIN[below])
+    starts = plane.starts
     surface, source, value = _corrected(solver, model, points, below)
     if surface is None or not 0 < value < 1:
         return None

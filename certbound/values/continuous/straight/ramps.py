@@ -6,8 +6,12 @@ Equations II, Sec. IV.5), whose three systems are one real and one complex one (
 
 *Ramps.* U = 0 at T and 1 on the faces do not go together. So on a face U rises: 1 - U falls at a rate k(tau), and moves
 along the face like the process whose motion across the face is left out; in a corner both faces' rates add up. So
-1 - U in a corner is the product of what it is along both faces, and the equation holds there too. Where more is needed
-in a corner (noises that go together), the source does it, which acts on faces as it does inside.
+1 - U in a corner is the product of what it is along both faces, and the equation holds there too.
+
+*Corners of noises that go together.* In coordinates in which they do not, a corner has another angle, some corners more
+than a right one, where second derivatives grow without limit: no source makes up for that. U of a box that is larger by
+a share of a cell on each side is smooth in the corners of its own box, and solves the same equation. The cells around
+it are left out of what is proposed.
 
 Lower bounds take U as it is. For upper bounds the ramp is over before T: U starts `SHIFT` ramps earlier, and is divided
 by its least value on the faces.
@@ -35,6 +39,7 @@ _RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a
 _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
 _LONGEST = 8  # steps of the horizon, at least
+_TOGETHER = 0.25  # a correlation that counts
 
 _R = 6**0.5
 _STAGES = np.array([(4 - _R) / 10, (4 + _R) / 10, 1.0])
@@ -54,12 +59,20 @@ _END_RATE = np.array([0.0, 1.0, 2.0, 3.0]) @ np.linalg.inv(_END)
 class Ramps:
     """The collocated equation on a grid; U is kept as the coefficients of its splines.
 
-    ``plane`` must not depend on time and have one branch.
+    ``plane`` must not depend on time and have one branch. Where noises go together, the box in which the equation is
+    solved is larger by ``margin`` times their correlation, in cells beside a face.
     """
 
-    def __init__(self, plane: Plane, cells: int, lead: float) -> None:
+    def __init__(self, plane: Plane, cells: int, lead: float, margin: float = 0.0) -> None:
         self.plane, self.lead = plane, lead
         nodes = [spread_nodes(plane, Plan(cells=cells, growth=_GROWTH, lead=lead), axis) for axis in (0, 1)]
+        shared = _correlation(plane, nodes)
+        wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
+        for one, inner in zip(wide, nodes):
+            one[[0, -1]] = inner[[0, -1]] + margin * shared * (one[[0, -1]] - inner[[0, -1]])
+        self.kept = slice(None)
+        if margin * shared > margin * _TOGETHER and _is_defined(plane, wide):
+            self.kept, nodes = slice(1, -1), wide
         self.nodes, self.splines = nodes, [Splines(one) for one in nodes]
         x, y = np.meshgrid(*(one.points for one in self.splines), indexing="ij")
         (force,), a = plane.drift(0.0, x, y), plane.square(0.0, x, y) * np.ones((2, 2, *x.shape))
@@ -132,14 +145,14 @@ class Ramps:
         shape = tuple(one.count for one in self.splines)
         tables = np.array([values, rates]).reshape(2, -1, *shape)
         first = np.einsum("iap,rkpq->rkiaq", maps[0], tables, optimize=True)
-        data = np.einsum("jbq,rkiaq->rkiajb", maps[1], first, optimize=True)[:, ::-1]
+        data = np.einsum("jbq,rkiaq->rkiajb", maps[1], first, optimize=True)[:, ::-1, self.kept, :, self.kept]
         forward = self.plane.horizon - times[::-1]
         forward[0], forward[-1] = 0.0, self.plane.horizon
 
         def made(scale: float, shift: float) -> Surface:
             found = Surface(
-                axes=tuple(self.nodes), times=forward, values=scale * data[0], start_rates=-scale * data[1, :-1],
-                end_rates=-scale * data[1, 1:],
+                axes=tuple(one[self.kept] for one in self.nodes), times=forward, values=scale * data[0],
+                start_rates=-scale * data[1, :-1], end_rates=-scale * data[1, 1:],
             )  # fmt: skip
             return found.raised(shift)
 
@@ -148,6 +161,21 @@ class Ramps:
         if below:  # U may rise over 1 beside corners
             return made(SMALL / max(1.0, top_of(whole)), -SMALL)
         return made(SMALL / max(min(low for low, _ in faces), 0.5), -SMALL)
+
+
+def _correlation(plane: Plane, nodes: list[Array]) -> float:
+    """The largest one of the noises across both faces in a corner."""
+    a = plane.square(0.0, *np.meshgrid(*(one[[0, -1]] for one in nodes), indexing="ij")) * np.ones((2, 2, 2, 2))
+    return float(np.max(np.abs(a[0, 1]) / np.sqrt(np.maximum(a[0, 0] * a[1, 1], 1e-300))))
+
+
+def _is_defined(plane: Plane, nodes: list[Array]) -> bool:
+    """Whether the model is defined, and all directions are noisy, on all of a grid."""
+    place = np.meshgrid(*nodes, indexing="ij")
+    with np.errstate(all="ignore"):
+        a = plane.square(0.0, *place) * np.ones((2, 2, *place[0].shape))
+        known = np.isfinite(plane.drift(0.0, *place)).all() and np.isfinite(a).all()
+        return bool(known and np.all(a[0, 0] * a[1, 1] > a[0, 1] ** 2) and np.all(a[0, 0] > 0))
 
 
 def _at(times: Array, values: Array, t: float) -> Array:
