@@ -84,6 +84,7 @@ cli.options cli.pictures cli.progress
 cli.clock cli.starters
 cli.commands
 cli
+__main__
 """
 CHECKER_ORDER = """
 report reading words

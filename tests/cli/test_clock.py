@@ -191,7 +191,7 @@ def test_as_many_paths_are_simulated_as_fit(
     assert answer(capsys, *words, "--paths", "500", "--time-limit", "30")[1]["paths"] == 500
 
 
-COMMAND = [sys.executable, "-m", "certbound.cli", "verify", "ou", "--method", "kummer"]
+COMMAND = [sys.executable, "-m", "certbound", "verify", "ou", "--method", "kummer"]
 
 
 def test_nothing_but_text_reaches_a_pipe(tmp_path: Path) -> None:

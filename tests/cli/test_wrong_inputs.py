@@ -277,7 +277,7 @@ def test_a_program_that_is_stopped_from_outside(tmp_path: Path) -> None:
     import signal
     import time
 
-    command = [sys.executable, "-m", "certbound.cli", "simulate", "ou", "--paths", "1e12", "--step", "0.005"]
+    command = [sys.executable, "-m", "certbound", "simulate", "ou", "--paths", "1e12", "--step", "0.005"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     # a program in the background of a shell inherits that Ctrl-C is ignored
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -303,7 +303,7 @@ def test_a_program_that_is_stopped_from_outside(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_goes_away_is_no_error(tmp_path: Path) -> None:
-    command = f"{sys.executable} -m certbound.cli problems --json | head -c 1"
+    command = f"{sys.executable} -m certbound problems --json | head -c 1"
     result = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=tmp_path)
     assert result.stdout == "{"
     assert result.stderr == ""

@@ -42,6 +42,7 @@ _BINDING = {
 }  # fmt: skip
 _NOT, _SIGN = 3, 7
 _LOGIC = ("and", "or", "not")
+_COMPOSED = ("where", "clip")  # of three arguments each, written by operations
 
 
 class _Token(NamedTuple):
@@ -211,15 +212,17 @@ class _Parser:
         if not is_function(name):
             if name in self.names or name in CONSTANTS:
                 raise self.fail(f"{name!r} is not a function; write * to multiply", token.place)
-            known = [*filter(is_function, [*OPERATIONS, "where"]), *self.networks]
+            known = [*filter(is_function, [*OPERATIONS, *_COMPOSED]), *self.networks]
             raise self.fail(f"unknown function {name!r}{nearest(name, known)}", token.place)
         arguments = self.arguments()
-        count = 3 if name == "where" else ARITY[name]
+        count = 3 if name in _COMPOSED else ARITY[name]
         if len(arguments) != count and not (name in ("min", "max") and len(arguments) > 2):
             wanted = f"{count} argument{'s' * (count > 1)}"
             raise self.fail(f"{name} takes {wanted}, got {len(arguments)}", token.place)
         if name == "where":
             return self.choice(*arguments)
+        if name == "clip":
+            return self.graph.apply("min", self.graph.apply("max", *arguments[:2]), arguments[2])
         node = self.graph.apply(name, *arguments[:count])
         for argument in arguments[count:]:
             node = self.graph.apply(name, node, argument)
@@ -258,10 +261,10 @@ class _Parser:
 
 def is_function(name: str) -> bool:
     """Whether expressions may call it: min and max take two arguments or more, every other as many as on a tape."""
-    return name == "where" or (name in OPERATIONS and OPERATIONS[name].in_files)
+    return name in _COMPOSED or (name in OPERATIONS and OPERATIONS[name].in_files)
 
 
-RESERVED = frozenset({"t", *filter(is_function, [*OPERATIONS, "where"]), *CONSTANTS, *_LOGIC})
+RESERVED = frozenset({"t", *filter(is_function, [*OPERATIONS, *_COMPOSED]), *CONSTANTS, *_LOGIC})
 """Names that no state, input, disturbance, parameter or definition may have."""
 
 

@@ -5,13 +5,16 @@ states, that sum becomes a state too: of vehicles that must keep their order the
 and drift have in common cancels then, and windows and boxes, which are entrywise, lose less. Where the dynamics bends
 along fewer sums of states than states (of generators the differences of angles), these sums become states, too, and the
 other coordinates come first: what all have in common wanders, and boxes of it cost most of what is bounded.
+
+States of very different sizes (metres of an atom's motion, and its speed) become multiples of powers of two: norms over
+all states, and grids that rest on them, are wide otherwise.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,7 +29,7 @@ from certbound.problem.sets import Faces, HalfSpace
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
 from certbound.safety.engines.rooms import log10_sum
-from certbound.safety.engines.turning import exact_product, turned_problem
+from certbound.safety.engines.turning import exact_product, scales_of, turned_problem
 
 Prove = Callable[[Problem, Request], EngineAnswer]
 Turn = tuple[Array, Array]
@@ -36,6 +39,8 @@ _UNASKED = EngineAnswer(applicable=False, reason="not asked in the states, as ot
 
 _MOST = 20  # states
 _LONGEST = 4000  # operations of a model that is looked through for sums
+_UNLIKE = 5  # the logarithm to the base 2 of states' ratio from which they are asked in other units, too
+_FAR = 12  # and first
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -70,7 +75,7 @@ def in_coordinates(prove: Prove, *, beside: Prove | None = None) -> Prove:
         before = asked.before if isinstance(asked.before, Turned | Apart) else None
         inner = replace(asked, before=before.answer.details if isinstance(before, Turned) else None)
         hasty = asked.quick or asked.first
-        turn = None if hasty or beside is not None else eased(problem)
+        turn = None if beside is not None else in_units(problem, _FAR) or (None if hasty else eased(problem))
         first: EngineAnswer | None = None
         if turn is not None:
             with contextlib.suppress(InfeasibleError, EnclosureError):
@@ -79,24 +84,27 @@ def in_coordinates(prove: Prove, *, beside: Prove | None = None) -> Prove:
                 return first
         plain = prove(problem, replace(asked, before=before.plain.details) if before else asked)
         enough = plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)
-        if hasty or enough or plain.conclusive:
-            return plain
-        try:
-            turn = turn or axes(problem)
-            if turn is None:
-                return plain
-            if plain.applicable and plain.log10_delta < 0:
+        if enough or (hasty and not plain.conclusive):
+            known = first is not None and first.applicable and first.log10_delta < min(plain.log10_delta, 0.0)
+            return first if known and first is not None and not enough else plain
+        best = plain
+        others = turns_of(problem, oblique=not plain.conclusive)
+        for other in [turn] if turn is not None and first is not None else others:
+            if best is plain and plain.applicable and plain.log10_delta < 0:
                 asked.found(plain)
-            rest = () if beside is None else _still_oblique(problem, turn)
-            if rest and beside is not None:
-                answer = _by_parts((prove, beside), problem, turn, rest, asked, plain)
-            elif first is not None:
-                answer = _instead(plain, first, reason=first.reason, details=replace(first.details, plain=plain))
-            else:
-                answer = _asked_in(prove, problem, turn, inner, plain)
-        except (InfeasibleError, EnclosureError):
-            return plain
-        return answer if answer.applicable and answer.log10_delta < min(plain.log10_delta, 0.0) else plain
+            with contextlib.suppress(InfeasibleError, EnclosureError):
+                rest = () if beside is None else _still_oblique(problem, other)
+                if rest and beside is not None:
+                    answer = _by_parts((prove, beside), problem, other, rest, asked, plain)
+                elif first is not None:
+                    answer = _instead(plain, first, reason=first.reason, details=replace(first.details, plain=plain))
+                else:
+                    answer = _asked_in(prove, problem, other, inner, plain)
+                if answer.applicable and answer.log10_delta < min(best.log10_delta, 0.0):
+                    best = answer
+            if is_at_most(min(best.log10_delta, 0.0), problem.delta):
+                break
+        return replace(best, conclusive=plain.conclusive)
 
     return proved
 
@@ -188,6 +196,25 @@ def axes(problem: Problem) -> Turn | None:
     return _sheared(turn, list(sums), sums, pivots)
 
 
+def turns_of(problem: Problem, *, oblique: bool) -> Iterator[Turn]:
+    """Other coordinates that are worth a try: of oblique limits, and of states of different sizes."""
+    with contextlib.suppress(InfeasibleError):
+        turn = axes(problem) if oblique else None
+        if turn is not None:
+            yield turn
+    units = in_units(problem, _UNLIKE)
+    if units is not None:
+        yield units
+
+
+def in_units(problem: Problem, least: int) -> Turn | None:
+    """States in units of powers of two near their sizes, where these differ by more than 2^least; None elsewhere."""
+    exponents = scales_of(problem)
+    if exponents is None or np.ptp(exponents) <= least:
+        return None
+    return np.diag(np.ldexp(1.0, -exponents)), np.diag(np.ldexp(1.0, exponents))
+
+
 def eased(problem: Problem) -> Turn | None:
     """Those coordinates, where the dynamics bends along fewer states of y than of x; None where it does not."""
     try:
@@ -242,4 +269,7 @@ def _noisy(problem: Problem, turn: Turn, place: int) -> bool:
 def _words(states: tuple[str, ...], matrix: Array) -> str:
     """The states of y that are none of x."""
     rows = [row for row in matrix if np.count_nonzero(row) > 1]
+    if not rows:
+        units = [f"{float(f'{1 / row[k]:.1g}'):g} for {states[k]}" for k, row in enumerate(matrix)]
+        return f"that are multiples of about {', '.join(units)}"
     return ", ".join(HalfSpace(row, 0.0).describe(states, "inside").partition(" <= ")[0] for row in rows)

@@ -7,6 +7,7 @@ breaks the same one, stated in y. The start is enclosed by a box, so that upper 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any
 
@@ -14,10 +15,74 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Tape, turned_tape
+from certbound.problem.model import Tape, compile_numpy, jacobian, turned_tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Faces, HalfSpace, Inside, Polytope, Region
 from certbound.problem.systems import ContinuousSystem
+
+_FINEST = 0.25  # of a turn of the dynamics, a first step
+_ORDER = 8
+_SWEEPS = 10
+_MOST_DOUBLINGS = 60
+
+
+def scales_of(problem: Problem) -> Array | None:
+    """Exponents of powers of two near what the noise and the starts make of each state, in floats; None if unknown.
+
+    The covariance along the dynamics at the middle of the starts, whose norm is that of balanced states.
+    """
+    system, n = problem.system, problem.system.dimension
+    if not isinstance(system, ContinuousSystem) or not np.isfinite(problem.horizon):
+        return None
+    hull, box = problem.initial.hull(), system.disturbance
+    pushes = [] if box is None else list((box.low + box.high) / 2)
+    place = [np.float64(value) for value in (0.0, *(hull.lo + hull.hi) / 2)]
+    with np.errstate(all="ignore"):
+        slopes = np.asarray(compile_numpy(jacobian(problem.closed_loop, tuple(range(1, n + 1))))(*place, *pushes))
+        given = system.diffusion
+        gain = np.asarray(compile_numpy(given)(*place) if isinstance(given, Tape) else given, dtype=float)
+        if not (np.isfinite(slopes).all() and np.isfinite(gain).all()):
+            return None
+        slopes = slopes.reshape(n, n)
+        size = _balance(slopes)
+        slopes = slopes * size / size[:, None]
+        gain, radius = gain / size[:, None], (hull.hi - hull.lo) / 2 / size
+        speed = float(np.abs(slopes).sum(axis=1).max()) * problem.horizon
+        doublings = int(np.clip(np.ceil(np.log2(max(speed, 1.0) / _FINEST)), 0, _MOST_DOUBLINGS))
+        step = problem.horizon / 2.0**doublings
+        moved, spread = np.eye(n) + sum(_powers(slopes * step)), gain @ gain.T * step
+        largest = np.diag(spread) + radius**2
+        for _ in range(doublings + 1):
+            found = np.diag(spread + (moved * radius**2) @ moved.T)
+            if not np.isfinite(found).all():
+                break
+            largest = np.maximum(largest, found)
+            spread, moved = spread + moved @ spread @ moved.T, moved @ moved
+        extent = np.sqrt(largest) * size
+    known = np.isfinite(extent) & (extent > 0)
+    if not known.any():
+        return None
+    extent = np.where(known, extent, np.exp(np.log(extent[known]).mean()))
+    return np.asarray(np.clip(np.round(np.log2(extent)), -900, 900).astype(int))
+
+
+def _powers(matrix: Array) -> Iterator[Array]:
+    """A^k / k! from k = 1 on."""
+    power = np.eye(len(matrix))
+    for k in range(1, _ORDER + 1):
+        power = power @ matrix / k
+        yield power
+
+
+def _balance(matrix: Array) -> Array:
+    """Sizes D of states such that rows and columns of D^-1 A D are about as large (Osborne's sweeps)."""
+    size, rest = np.ones(len(matrix)), np.abs(matrix * (1 - np.eye(len(matrix))))
+    for _ in range(_SWEEPS):
+        for i in range(len(matrix)):
+            column, row = (rest[:, i] / size).sum() * size[i], (rest[i] * size).sum() / size[i]
+            if column > 0 and row > 0:
+                size[i] *= math.sqrt(row / column)
+    return size
 
 
 def exact_product(a: Array, b: Array) -> Array:

@@ -67,6 +67,7 @@ def test_an_expression_means_what_python_means(text, values):
         ("1 + 2 > 2 and not 3 <= 2 or 1 == 2", 1),
         ("not 1 == 2 and 1 != 1", 0),
         ("where(x > 0, 7, where(y >= x, 2, 3))", 2),
+        ("clip(-7, -2, 5) + 10*clip(7, -2, 5) + 100*clip(1, -2, 5)", 148),
     ],
 )
 def test_precedence_and_functions(text, value):
@@ -116,6 +117,7 @@ def test_precedence_and_functions(text, value):
         ("x < y < z", r"a chain of comparisons does not exist here; write a < b and b < c"),
         ("x <> y", "expected a value, got '>'"),
         ("where(x > 0, y)", "where takes 3 arguments, got 2"),
+        ("clip(x, 1)", "clip takes 3 arguments, got 2"),
         ("where", r"where is a function; write where\(\.\.\.\)"),
         ("\u03c0", "unknown name .\u03c0."),
         ("\u0663", "such a character does not exist here"),

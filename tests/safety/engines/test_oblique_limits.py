@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -20,8 +21,8 @@ from certbound.problem.model import Tape, compile_numpy, turned_tape
 from certbound.safety.answers import EngineAnswer, Request, exact
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.engines import Apart, Turned, in_coordinates, linear_engine
-from certbound.safety.engines.oblique_limits import axes, eased
-from certbound.safety.engines.turning import exact_product, turned_problem
+from certbound.safety.engines.oblique_limits import axes, eased, turns_of
+from certbound.safety.engines.turning import exact_product, scales_of, turned_problem
 from certbound.safety.verdict import verdict_of
 from experiments.middle import platoon
 
@@ -64,6 +65,37 @@ def rotors() -> cb.Problem:
     )
     safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
     return cb.Problem(system, initial=[0.25, 0.0], safe=safe, horizon=0.5, delta=1e-2)
+
+
+def spring(size: float) -> cb.Problem:
+    """A noisy spring whose speed is stated in other units; in metres and seconds those of an atom's tip are."""
+    system = cb.ContinuousSystem(
+        lambda x: [size * x[1], -x[0] / size - 0.25 * x[1]], states=["z", "v"], diffusion=[[0.0], [1.25 / size]]
+    )
+    safe = [cb.Inside(cb.HalfSpace([1.0, 0.0], 6.0))]
+    return cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=2.0, delta=1e-60)
+
+
+@functools.cache
+def of_one_size() -> EngineAnswer:
+    return in_coordinates(linear_engine)(spring(1.0))
+
+
+@pytest.mark.parametrize("size", [2.0**10, 2.0**16])
+def test_states_of_different_sizes_are_asked_in_units_of_their_own(size: float) -> None:
+    problem = spring(size)
+    found = in_coordinates(linear_engine)(problem)
+    assert isinstance(found.details, Turned)
+    assert "multiples of about" in found.reason
+    assert found.log10_delta == pytest.approx(of_one_size().log10_delta, rel=0.01)
+    assert linear_engine(problem).log10_delta > found.log10_delta + 0.01
+
+
+def test_states_of_one_size_keep_their_units() -> None:
+    assert list(turns_of(spring(4.0), oblique=False)) == []
+    exponents = scales_of(spring(2.0**40))
+    assert exponents is not None
+    assert exponents[0] - exponents[1] == pytest.approx(40, abs=1)
 
 
 def test_the_sums_along_which_a_model_bends_become_states() -> None:

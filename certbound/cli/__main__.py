@@ -1,6 +1,0 @@
-"""``python -m certbound.cli`` does what the installed ``certbound`` does."""
-
-from certbound.cli import main
-
-if __name__ == "__main__":
-    main()
