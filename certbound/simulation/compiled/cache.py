@@ -25,7 +25,8 @@ from typing import Any
 
 from certbound._version import __version__
 from certbound.lazy import uncollected
-from certbound.simulation.compiled.entry import entered
+from certbound.simulation.compiled.entry import FOLLOW, KERNEL, enter, entered
+from certbound.simulation.compiled.particles import replicate
 from certbound.watch import undisturbed
 
 logger = logging.getLogger(__name__)
@@ -137,7 +138,7 @@ def _run(digest: str, source: str, folder: Path | None) -> Callable[..., Any]:
     exec(compile(text, str(path or f"<kernel {digest}>"), "exec"), module.__dict__)  # noqa: S102
     if path is not None:
         _seal(path)
-    return entered(module.run)
+    return entered(module.run, ((KERNEL, enter), (FOLLOW, replicate)))
 
 
 def _source(folder: Path, digest: str) -> Path:
