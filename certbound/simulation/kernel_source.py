@@ -35,6 +35,7 @@ import numpy as np
 from numba import njit
 
 from certbound.simulation.compiled.elementary import atan2, sincos, tanh
+from certbound.simulation.compiled.entry import KERNEL
 from certbound.simulation.compiled.streams import draw_{variate}, uniform
 from certbound.simulation.compiled.supremum import STRETCH, bin_of, crossed, raise_top, rise_between, touches
 
@@ -42,10 +43,7 @@ from certbound.simulation.compiled.supremum import STRETCH, bin_of, crossed, rai
 
 SIGNATURE = """
 @njit(
-    "int64(uint64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], int64[:, ::1], "
-    "float64[:, ::1], float64[::1], int64[::1], float64[::1], int64, "
-    "int64[:, ::1], int64[:, :, :, ::1], float64[:, :, ::1], float64[::1])",
-    nogil=True, cache=@CACHE@, error_model="numpy", no_cfunc_wrapper=True,
+    KERNEL, nogil=True, cache=@CACHE@, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True,
 )
 def run(
     stream, starts, signals, inputs, moving, windows, nominal, profile, marks, p, steps,

@@ -47,7 +47,7 @@ def aimed():
     problem = walk()
     model, target = exits._model(problem), cb.Box([-0.2, -0.2], [0.2, 0.2])
     aims = [targets._aim(problem, model, target, upper=side) for side in (True, False)]
-    plan = dataclasses.replace(targets._plan(1.0, math.log(0.4), 18), growth=0.4)
+    plan = dataclasses.replace(targets._plan(1.0, math.log(0.4), 12), growth=0.6)
     return [(aim, propose_to_target(aim.plane, plan, target, upper=aim.upper)) for aim in aims]
 
 
@@ -124,7 +124,7 @@ def chains():
     for upper in (True, False):
         stages = windows.stages_of(problem, floats, inner=upper)
         chain = windows._Chain(plane=floats, model=model, stages=stages, starts=starts, points=None, upper=upper)
-        found.append((chain, windows._surfaces(chain, 14, -1.0, passes=0)))
+        found.append((chain, windows._surfaces(chain, 10, -1.0, passes=0)))
     return found
 
 

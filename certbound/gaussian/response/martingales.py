@@ -153,6 +153,8 @@ class Windowed:
         Which pieces lie before the window's end.
     bulge : ndarray, shape (N, n, n)
         How far a row may leave its chord inside a piece, per unit of its size.
+    magnitude : ndarray, shape (W, N + 1, n, n)
+        Absolute values of ``basis``.
     """
 
     def __init__(self, response: LinearResponse, cell: int) -> None:
@@ -175,13 +177,14 @@ class Windowed:
         for j in range(pieces - 1, -1, -1):
             later = self.inside[:, j]
             self.basis[later, j] = self.basis[later, j + 1] @ self.transition[j]
+        self.magnitude = np.abs(self.basis)
 
     def loss(self, directions: Array, late: Array) -> Array:
         """Entrywise bound of |rho_{k+1} F - rho_k| for the float rows rho = directions . basis: (W, N, n)."""
         n = late.shape[2]
-        sizes = np.einsum("wi,wkij->wkj", np.abs(directions), np.abs(self.basis[:, 1:]))
-        rounding = 6 * (n + 2) * _UNIT * np.einsum("wki,kij->wkj", sizes, np.abs(self.transition))
-        own = 6 * (n + 2) * _UNIT * np.einsum("wi,wkij->wkj", np.abs(directions), np.abs(self.basis[:, :-1]))
+        sizes = np.einsum("wi,wkij->wkj", np.abs(directions), self.magnitude)
+        rounding = 6 * (n + 2) * _UNIT * np.einsum("wki,kij->wkj", sizes[:, 1:], np.abs(self.transition))
+        own = 6 * (n + 2) * _UNIT * sizes[:, :-1]
         return np.asarray(rounding + own + np.abs(late).sum(axis=-1)[..., None] * self.error[:, None] + _TINY)
 
 

@@ -25,6 +25,8 @@ from typing import Any
 
 from certbound._version import __version__
 from certbound.lazy import uncollected
+from certbound.simulation.compiled.entry import FOLLOW, KERNEL, enter, entered
+from certbound.simulation.compiled.particles import replicate
 from certbound.watch import undisturbed
 
 logger = logging.getLogger(__name__)
@@ -99,7 +101,7 @@ def _fingerprint() -> str:
     import numba
 
     here = Path(__file__)
-    names = ("cache.py", "elementary.py", "particles.py", "streams.py", "supremum.py")
+    names = ("cache.py", "elementary.py", "entry.py", "particles.py", "streams.py", "supremum.py")
     helpers = b"".join(here.with_name(name).read_bytes() for name in names)
     return f"{__version__} {numba.__version__} {sys.version} {hashlib.sha256(helpers).hexdigest()}"
 
@@ -136,8 +138,7 @@ def _run(digest: str, source: str, folder: Path | None) -> Callable[..., Any]:
     exec(compile(text, str(path or f"<kernel {digest}>"), "exec"), module.__dict__)  # noqa: S102
     if path is not None:
         _seal(path)
-    run: Callable[..., Any] = module.run
-    return run
+    return entered(module.run, ((KERNEL, enter), (FOLLOW, replicate)))
 
 
 def _source(folder: Path, digest: str) -> Path:

@@ -8,6 +8,10 @@ Importing this module imports numba: import it inside functions.
 
 from __future__ import annotations
 
+import numpy as np
+from numba import njit, types
+
+from certbound.simulation.compiled.entry import FOLLOW, KERNEL, OPTIONS, leap
 from certbound.simulation.compiled.streams import inner, uniform
 
 
@@ -91,3 +95,54 @@ ranked = inner(_ranked)
 survive = inner(_survive)
 branch = inner(_branch)
 read_scores = inner(_read_scores)
+_follow = leap(FOLLOW)
+
+
+def _replicate(  # type: ignore[no-untyped-def]
+    address, stream, starts, signals, inputs, moving, windows, nominal, profile, marks, p, steps, counts, marginals,
+    out, notes,
+):  # fmt: skip
+    """One replica: the estimate goes to ``out[0, 0, 0]``, the exits behind it; ``address`` is that of `FOLLOW`.
+
+    ``profile[0]`` is the share of particles that a round discards; paths have noise-free ones of their own where
+    ``marks`` is not empty.
+    """
+    count, dimension = starts.shape
+    states = np.empty((count, steps + 1, dimension))
+    frees = np.empty((count if len(marks) > 0 else 0, steps + 1, dimension))
+    tops = np.zeros((count, steps + 1))
+    scores = np.empty(count)
+    alive = np.empty(count, dtype=np.int64)
+    survivors = done = left = 0
+    level, weight = -1.0, 1.0
+    while count > 0:
+        for path in range(count):
+            if survivors > 0 and scores[path] > level:
+                continue
+            if survivors > 0:
+                first = branch(stream, alive, survivors, level, path, signals, states, frees, tops)
+            else:
+                first = 0
+                place(starts, path, states, frees)
+            moved = _follow(
+                address,
+                (stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, first),
+            )
+            if moved < 0:
+                return -1
+            done += moved
+        left = read_scores(tops, scores)
+        level = ranked(scores, int(profile[0] * count) - 1)
+        if level >= 1.0:
+            break
+        survivors = survive(scores, level, alive)
+        if survivors == 0:
+            break
+        weight *= survivors / count
+    if count > 0:
+        out[0, 0, 0] = weight * left / count
+        out[0, 0, 1] = left
+    return done
+
+
+replicate = njit(types.int64(types.uintp, *KERNEL.args), **OPTIONS)(_replicate)

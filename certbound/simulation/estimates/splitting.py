@@ -26,8 +26,6 @@ from certbound.simulation.estimates.statistics import bound_binomial, check_conf
 from certbound.simulation.executors import Progress, run_work
 from certbound.simulation.gap_tests import Barrier, barriers_of, tables_of
 from certbound.simulation.kernel_source import (
-    NJIT,
-    SIGNATURE,
     close_noise,
     function_lines,
     kernel_body,
@@ -131,6 +129,8 @@ def simulate_rare_exits(
         RareWork,
         nominal=setting.nominal(),
         **tables_of(barriers),
+        profile=np.array([_DISCARDED]),
+        marks=np.ones(1 if own else 0, dtype=np.int64),
         counts_shape=(replicas, 2),
         paths=replicas * particles,
         block=particles,
@@ -195,60 +195,24 @@ class RareWork(Work):
 
 
 _IMPORTS = """
-from certbound.simulation.compiled.particles import branch, hold, place, ranked, read_scores, survive
+from certbound.simulation.compiled.entry import FOLLOW
+from certbound.simulation.compiled.particles import hold
 from certbound.simulation.compiled.supremum import fall_between
 """
 
-_FOLLOW = f"""
-{NJIT}
-def follow(
+_RUN = """
+@njit(
+    FOLLOW, nogil=True, cache=@CACHE@, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True,
+)
+def run(
     stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path, first
 ):
     done = 0
 """
 
-_REPLICA = """\
-    count, dimension = starts.shape
-    states = np.empty((count, steps + 1, dimension))
-    frees = np.empty(({frees}, steps + 1, dimension))
-    tops = np.zeros((count, steps + 1))
-    scores = np.empty(count)
-    alive = np.empty(count, dtype=np.int64)
-    survivors = done = left = 0
-    level, weight = -1.0, 1.0
-    while count > 0:
-        for path in range(count):
-            if survivors > 0 and scores[path] > level:
-                continue
-            if survivors > 0:
-                first = branch(stream, alive, survivors, level, path, signals, states, frees, tops)
-            else:
-                first = 0
-                place(starts, path, states, frees)
-            moved = follow(
-                stream, signals, inputs, moving, windows, nominal, p, steps, notes, states, frees, tops, path,
-                first,
-            )
-            if moved < 0:
-                return -1
-            done += moved
-        left = read_scores(tops, scores)
-        level = ranked(scores, int({discarded} * count) - 1)
-        if level >= 1.0:
-            break
-        survivors = survive(scores, level, alive)
-        if survivors == 0:
-            break
-        weight *= survivors / count
-    if count > 0:
-        out[0, 0, 0] = weight * left / count
-        out[0, 0, 1] = left
-    return done
-"""
-
 
 def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tuple[str, Array]:
-    """Source of the splitting kernel; ``run`` writes the estimate to ``out[0, 0, 0]``."""
+    """Source of the splitting kernel, which runs one particle on from a step; see `compiled.particles`."""
     p = start_text(model)
     functions = function_lines(model, p)
     step, bridge = step_lines(model, p)
@@ -267,6 +231,5 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
     out = ["if top >= 1.0:", "    hold(tops, path, first, top)", "    return done"]
     body = [*open_noise(model, p), *load, *begin, *out, "for k in range(first, steps):", *indent(loop)]
     body += [close_noise(), "return done"]
-    run = SIGNATURE + _REPLICA.format(frees="count" if own else "0", discarded=_DISCARDED)
-    text = module_text(model, "splitting", functions, p) + _IMPORTS + _FOLLOW + kernel_body(body, p) + run
+    text = module_text(model, "splitting", functions, p) + _IMPORTS + _RUN + kernel_body(body, p)
     return text, np.array([*p.values, 0.0])

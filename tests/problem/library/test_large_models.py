@@ -36,7 +36,7 @@ def test_the_power_flow_is_a_rest_of_the_grid_and_flows_add_up_to_nothing():
     [
         (formation(agents=3), -0.3, -0.15),
         (heat(nodes=5), -8.0, -7.0),
-        (kuramoto(oscillators=6), -np.cos(0.7) - 1e-9, -np.cos(0.7) + 1e-6),
+        (kuramoto(oscillators=5), -np.cos(0.7) - 1e-9, -np.cos(0.7) + 1e-6),
     ],
     ids=["formation", "heat", "kuramoto"],
 )
