@@ -19,8 +19,8 @@ is beyond alone, the inside is not looked at (m = 0): then all that is counted m
 too, 1/Phi(-gamma sqrt(h)/s) stands beyond the face: the noise of the rest outweighs the drift that often.
 
 Paths that met the face at one place come to several lines of y, and each of these three means holds where all lines
-count like that. The drift is at most that of the line where it is least, which is of the first kind among them. So lines
-of the later kinds (stronger drifts) also count what the earlier kinds in their window ask for, with m = 0.
+count like that. The drift is at most that of the line where it is least, which is of the first kind among them. So
+lines of the later kinds (stronger drifts) also count what the earlier kinds in their window ask for, with m = 0.
 """
 
 from __future__ import annotations
