@@ -169,8 +169,10 @@ def mirrors_of(
                 window[line] = faces[k].window[line]
             least = float(faces[0].inward.lo[line])
             rates[2, line], factors[2, line] = _granted(least, setting.noise, clock.step, depths)
-        around = _window(y, np.maximum(window, faces[-1].window))
+        spread = np.maximum.reduce([face.window for face in faces])
+        around = _window(y, np.where((kind > 1) & (spread == 0), np.inf, spread))  # 0: not known
         levels = np.maximum(levels, _alike(kind, rates, factors, own, around))
+        factors[2] = _most(factors[2], around)  # as what is made up for on one line may be lost on another
         mirror = Mirror(
             inside=inside, beyond=beyond, depths=depths, places=places, rate=rates[0], factor=factors[0],
             blind=kind != 0, window=_window(y, window),
