@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -167,6 +168,11 @@ class Watch:
         def stop(number: int, frame: FrameType | None) -> None:
             raise OutOfTime
 
+        def lost(what: sys.UnraisableHookArgs) -> None:
+            if not isinstance(what.exc_value, OutOfTime):  # into a callback of compiled code; the timer goes on
+                told(what)
+
+        told, sys.unraisablehook = sys.unraisablehook, lost
         before, began = signal.signal(signal.SIGALRM, stop), time.perf_counter()
         alarm = max(self.left, 0.0) + _GRACE * self.limit + _GRACE
         outer, again = signal.setitimer(signal.ITIMER_REAL, alarm, _AGAIN)
@@ -175,6 +181,7 @@ class Watch:
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, before)
+            sys.unraisablehook = told
             if outer > 0:  # a timer of a watch around this one goes on
                 signal.setitimer(signal.ITIMER_REAL, max(outer - (time.perf_counter() - began), _GRACE), again)
 

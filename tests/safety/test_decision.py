@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
+import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -350,6 +353,13 @@ def test_a_row_that_does_not_poll_is_ended_by_a_timer_that_leaves_no_trace(monke
     assert (verdict.status, verdict.log10_delta) == ("UNKNOWN", -1.0)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert signal.getsignal(signal.SIGALRM) is before
+
+
+def test_a_timer_that_goes_off_in_a_callback_of_compiled_code_goes_off_again_without_a_word() -> None:
+    before, lose = sys.unraisablehook, ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGALRM))
+    with pytest.raises(OutOfTime), Watch(0.01).running():
+        time.sleep(5 if lose() is None else 0)
+    assert sys.unraisablehook is before
 
 
 def test_an_upper_bound_near_the_truth_that_is_too_large_is_answered_from_below() -> None:

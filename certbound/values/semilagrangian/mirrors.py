@@ -17,6 +17,10 @@ the drift, which e^{rate d} is: 6 Phi(-(w - 2 gamma sqrt(h)/s))), which a factor
 cut off at `_MOST`, and what is lost beyond the last node before is made up for as well. Where that is too much for what
 is beyond alone, the inside is not looked at (m = 0): then all that is counted makes up for it. Where this is too much,
 too, 1/Phi(-gamma sqrt(h)/s) stands beyond the face: the noise of the rest outweighs the drift that often.
+
+Paths that met the face at one place come to several lines of y, and each of these three means holds where all lines
+count like that. The drift is at most that of the line where it is least, which is of the first kind among them. So
+lines of the later kinds (stronger drifts) also count what the earlier kinds in their window ask for, with m = 0.
 """
 
 from __future__ import annotations
@@ -60,6 +64,8 @@ class Mirror:
         Lines on which the inside is not looked at.
     window : (ndarray of int, ndarray of int), shapes (ny,)
         First and last line (excluded) that a path may come to.
+    most : float
+        Where e^{rate d} is cut off from above.
     """
 
     inside: Index
@@ -70,6 +76,7 @@ class Mirror:
     factor: Array
     blind: Mask
     window: tuple[Index, Index]
+    most: float = _MOST
 
     def above(self, nodal: Array, bend: Array, dq: Array) -> Array:
         """Values at ``places``, shape (ny, P), for upper bounds."""
@@ -78,8 +85,7 @@ class Mirror:
         share = 1 - np.clip(least - _SLACK, 0.0, 1.0)  # beyond, never less than 1: else a larger drift might count less
         share = np.where(self.blind[:, None], 1.0, share)
         rate = np.nan_to_num(self.rate)[:, None]
-        highest = np.log(np.where(self.blind, _MOST / 10, _MOST))[:, None]
-        power = np.exp(np.minimum(rate * self.depths, highest) * _UP)
+        power = np.exp(np.minimum(rate * self.depths, math.log(self.most)) * _UP)
         power = np.where(np.isnan(self.rate)[:, None], 0.0, power)
         return self._all((1 + power * share) * self.factor[:, None])
 
@@ -115,7 +121,7 @@ class Mirror:
     def _extreme(self, value: Array, pick: np.ufunc) -> Array:
         """The least (largest) value in the window of every line."""
         found = value.copy()
-        for line in np.flatnonzero(~np.isnan(self.rate)):
+        for line in np.flatnonzero(~np.isnan(self.rate) & ~self.blind):
             found[line] = pick.reduce(value[self.window[0][line] : self.window[1][line]], axis=0)
         return found
 
@@ -144,8 +150,8 @@ def mirrors_of(
         inside, beyond = _pairs(q, end, side)
         places = np.arange(beyond[0], len(q) if side else -1, 1 if side else -1)
         depths = np.abs(q[beyond] - end)
-        rates, factors = np.full((2, len(y)), np.nan), np.ones((2, len(y)))
-        blind, window = np.zeros(len(y), dtype=bool), faces[-1].window.copy()
+        rates, factors = np.full((3, len(y)), np.nan), np.ones((3, len(y)))  # inside looked at, not looked at; below
+        kind, window, own = np.full(len(y), -1), faces[-1].window.copy(), np.zeros(levels.shape)
         for line in np.flatnonzero(np.isfinite(drift)):
             most = [float(face.inward.hi[line]) for face in faces]
             options = (
@@ -155,19 +161,29 @@ def mirrors_of(
             k, unseen, found = next((option for option in options if option[-1]), (0, False, None))
             if found is None:
                 margin, level = _levelled([*most, float(drift[line])], setting.noise, clock.step)
-                levels[line, _from(q, end, side, margin)] = level
+                own[line, _from(q, end, side, margin)] = level
+                kind[line] = 3 if margin > 0 else 2
             else:
-                (rates[0, line], factors[0, line]), blind[line] = found, unseen
+                kind[line] = int(unseen)
+                rates[kind[line], line], factors[kind[line], line] = found
                 window[line] = faces[k].window[line]
             least = float(faces[0].inward.lo[line])
-            rates[1, line], factors[1, line] = _granted(least, setting.noise, clock.step, depths)
+            rates[2, line], factors[2, line] = _granted(least, setting.noise, clock.step, depths)
+        spread = np.maximum.reduce([face.window for face in faces])
+        around = _window(y, np.where((kind > 1) & (spread == 0), np.inf, spread))  # 0: not known
+        levels = np.maximum(levels, _alike(kind, rates, factors, own, around))
+        factors[2] = _most(factors[2], around)  # as what is made up for on one line may be lost on another
         mirror = Mirror(
-            inside=inside, beyond=beyond, depths=depths, places=places, rate=rates[0], factor=factors[0], blind=blind,
-            window=_window(y, window),
+            inside=inside, beyond=beyond, depths=depths, places=places, rate=rates[0], factor=factors[0],
+            blind=kind != 0, window=_window(y, window),
         )  # fmt: skip
         above.append(mirror)
+        if not np.isnan(rates[1]).all():
+            above.append(replace(mirror, rate=rates[1], factor=factors[1], blind=kind >= 0, most=_MOST / 10))
         if math.isfinite(setting.beyond[1][side]):
-            below.append(replace(mirror, rate=rates[1], factor=factors[1], window=_window(y, faces[0].window)))
+            below.append(replace(
+                mirror, rate=rates[2], factor=factors[2], blind=kind < -1, window=_window(y, faces[0].window),
+            ))  # fmt: skip
     return above, below, levels
 
 
@@ -177,6 +193,25 @@ def _window(y: Array, spread: Array) -> tuple[Index, Index]:
     first = np.searchsorted(y, before - spread, side="right") - 1
     last = np.searchsorted(y, after + spread) + 1
     return np.maximum(first, 0), np.minimum(last, len(y))
+
+
+def _alike(kind: Index, rates: Array, factors: Array, levels: Array, around: tuple[Index, Index]) -> Array:
+    """Let lines count what those of earlier kinds around them ask for, in ``rates`` and ``factors``; the levels then.
+
+    ``kind``: 0 where the inside is looked at, 1 where it is not, 2 where a level stands beyond the face, 3 where one
+    begins before it, -1 where nothing is asked.
+    """
+    for k in (0, 1):
+        top = _most(np.where(kind == k, rates[k], -np.inf), around)
+        later = (kind > k) & (top > -np.inf)
+        rates[k] = np.where(later, top, rates[k])
+        factors[k] = np.where(later | (kind == k), _most(factors[k], around), 1.0)
+    return np.where((kind == 3)[:, None], np.maximum(levels, _most(levels * (kind == 2)[:, None], around)), levels)
+
+
+def _most(values: Array, around: tuple[Index, Index]) -> Array:
+    """The largest value on the lines around every line of y."""
+    return np.stack([values[first:last].max(axis=0) for first, last in zip(*around)])
 
 
 def _pairs(q: Array, face: float, side: int) -> tuple[Index, Index]:

@@ -331,3 +331,20 @@ def test_cells_beside_a_face_pay_for_paths_that_leave_and_come_back_within_a_ste
             assert found <= paid[row, column]
             seen = max(seen, found)
     assert seen > 5e-4
+
+
+def test_whoever_met_a_face_counts_once_in_the_mean_on_whichever_line_it_ends() -> None:
+    drifts, depths, fine = [0.9, 1.5, 2.2, 3.5], np.linspace(0, 8, 161), (np.arange(40000) + 0.5) / 5000
+    rates, factors = np.full((2, 4), np.nan), np.ones((2, 4))
+    for k in (0, 1):
+        rates[k, k], factors[k, k] = mirrors._paid(drifts[k], 1.0, 1.0, depths, (6.0, 0.15), blind=k == 1)
+    levels = np.array([0, 0, *(mirrors._levelled([math.inf, drift], 1.0, 1.0)[1] for drift in drifts[2:])])[:, None]
+    around = np.array([0, 0, 1, 2]), np.array([2, 3, 4, 4])  # paths come to a line and the next ones
+    levels = mirrors._alike(np.arange(4), rates, factors, levels, around)
+    found = levels + 0 * fine
+    for rate, factor, most in zip(rates, factors, (2000, 200)):
+        asks = factor[:, None] * (1 + np.exp(np.minimum(rate[:, None] * fine, np.log(most))))
+        found = np.maximum(found, np.where(np.isnan(asks), 0, asks))
+    for first in range(3):  # such a path has the lesser drift, whatever its line is
+        density = np.exp(-((fine + drifts[first]) ** 2) / 2) / math.sqrt(2 * math.pi) / 5000
+        assert (density * np.minimum(found[first], found[first + 1])).sum() > 1 - 1e-6
