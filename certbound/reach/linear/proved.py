@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
@@ -170,6 +169,14 @@ Path = tuple[tuple[int, bool], ...]
 """Halvings of the initial set: along which side, and whether the upper half is kept."""
 
 
+def _cover(paths: list[Path]) -> bool:
+    """Whether these are the leaves of one tree of halvings."""
+    if () in paths:
+        return len(paths) == 1
+    halves = [[path[1:] for path in paths if path[0][1] == upper] for upper in (False, True)]
+    return len({path[0][0] for path in paths}) == 1 and all(map(_cover, halves))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SplitAnswer(LinearAnswer):
     """Answers for the cells of the initial set, each with a run of its own: the worst one is the answer.
@@ -192,8 +199,7 @@ class SplitAnswer(LinearAnswer):
         EngineError
             A part of the initial set lies in no cell: whatever interrupted the search, nothing is proved of that.
         """
-        paths = {path for path, _, _, _ in cells}
-        if len(paths) < len(cells) or sum(Fraction(1, 2 ** len(path)) for path in paths) != 1:
+        if not _cover([path for path, _, _, _ in cells]):
             raise EngineError("the cells of the initial set do not cover it.")
         parts = tuple(part for _, _, _, part in cells)
         worst = max(parts, key=lambda part: part.outcome.log_probability)

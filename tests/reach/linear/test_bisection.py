@@ -49,7 +49,9 @@ def test_unequal_cells_cover_the_starts_and_meet_the_target(split: SplitAnswer) 
 def test_a_cell_that_was_lost_on_the_way_is_missed(split: SplitAnswer) -> None:
     cells = list(zip(split.paths, split.low, split.high, split.parts))
     assert SplitAnswer.of(cells).outcome is split.outcome
-    for wrong in (cells[1:], [*cells[1:], cells[1]]):
+    path, *rest = cells[0]
+    other = ((1 - path[-1][0], path[-1][1]),)  # the same half of the other side
+    for wrong in (cells[1:], [*cells[1:], cells[1]], [((*path[:-1], *other), *rest), *cells[1:]], []):
         with pytest.raises(EngineError, match="do not cover"):
             SplitAnswer.of(wrong)
 
