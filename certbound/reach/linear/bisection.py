@@ -9,6 +9,7 @@ Where even its middle alone, as a start, is out of reach, no halving helps.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,6 +30,7 @@ from certbound.rigor.intervals import Interval
 from certbound.watch import executor_lent, jobs_allowed, poll
 
 _DEPTH = 4  # halvings of every side
+_BEYOND = 2  # halvings more than make as many equal cells as may be looked at, after which a cell is hopeless
 _LOOK = 3  # halvings between two looks at the middle of a cell
 _MOST_PIECES = 16_000  # pieces of time times cells that are looked at
 _SPARE = 4_000  # cells times steps times squared states that may be spent on less than the target
@@ -141,6 +143,8 @@ class Bisection:
         self.root = _Leaf(np.array(boxes.lo[0]), np.array(boxes.hi[0]))
         self.middle = self.root.middle
         self.wide = int(np.count_nonzero(self.root.low < self.root.high))
+        equal = math.log2(max(_MOST_PIECES / whole.engine.pieces, 1.0))
+        self.deepest = min(_DEPTH * self.wide, math.ceil(equal) + _BEYOND)
         self.open: dict[_Leaf, tuple[float, _Hint]] = {self.middle: (np.inf, _Hint())} if self.wide else {}
         self.done: list[_Proof] = []
         self.count = 1
@@ -178,7 +182,7 @@ class Bisection:
             poll(f"cells of the initial set: {len(self.done)} done, {len(self.open)} to do")
             while len(self.flying) < min(self.workers.width, len(self.open)):
                 waiting = (leaf for leaf in self.open if leaf not in self.flying)
-                self._ask(most := max(waiting, key=lambda leaf: self.open[leaf][0]), proving=most is not self.middle)
+                self._ask(most := max(waiting, key=self._first), proving=most is not self.middle)
             for leaf, seen, looked in self._finished():
                 if looked and leaf is not self.middle and (seen.promising or self._lost):
                     continue
@@ -186,7 +190,7 @@ class Bisection:
                 if seen.found is not None:
                     self.done.append((leaf, seen))
                 elif leaf is not self.middle:
-                    if seen.hopeless or len(leaf.path) >= _DEPTH * self.wide:
+                    if seen.hopeless or len(leaf.path) >= self.deepest:
                         return None
                     self.open |= dict.fromkeys(leaf.halves(seen.side), (seen.urgency, seen.hint))
                     self.count += 2
@@ -221,6 +225,10 @@ class Bisection:
             done = [item for item in done if item is not worst] + halves
             spare -= 2
         return done
+
+    def _first(self, leaf: _Leaf) -> tuple[float, int]:
+        """What needs most halvings comes first, of that what has most: it fails first."""
+        return self.open[leaf][0], len(leaf.path)
 
     @property
     def _lost(self) -> bool:
