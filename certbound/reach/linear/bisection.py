@@ -34,7 +34,10 @@ _BEYOND = 2  # halvings more than make as many equal cells as may be looked at, 
 _LOOK = 3  # halvings between two looks at the middle of a cell
 _MOST_PIECES = 16_000  # pieces of time times cells that are looked at
 _SPARE = 4_000  # cells times steps times squared states that may be spent on less than the target
+_FEW = 8  # cells for less than the target where the whole meets it
 _MORE = 2  # times the cells that the target took, at most
+CLEARLY = 1.25
+"""How many times as large the logarithm must become where the whole meets the target and is halved for less."""
 _ENOUGH = 10.2  # times its logarithm, beyond which less is worth nothing
 
 
@@ -153,14 +156,14 @@ class Bisection:
 
     @classmethod
     @contextlib.contextmanager
-    def of(cls, whole: LinearRun, target: Share) -> Iterator[Bisection]:
-        """With as many processes as are allowed; what time ended goes on where it was."""
+    def of(cls, whole: LinearRun, target: Share, *, met: bool = False) -> Iterator[Bisection]:
+        """With as many processes as are allowed; what time ended goes on where it was. ``met``: for `finer` only."""
         found: Bisection = whole.halving or cls(whole, target)
         whole.halving = found
         asked = partial(_look, found.problem, found.pieces, target)
         with staff(asked, jobs_allowed(), executor_lent()) as found.workers:
             found.flying = {}
-            if found.workers.apart and found.middle in found.open:
+            if found.workers.apart and found.middle in found.open and not met:
                 found._ask(found.middle)
             yield found
 
@@ -198,17 +201,33 @@ class Bisection:
                     return None
             if self.count * self.whole.engine.pieces > _MOST_PIECES:
                 return None
-        done = self.done
-        if not self.whole.engine.continuous:  # elsewhere events are dear
-            work = self.whole.engine.pieces * self.whole.engine.n**2
-            done = self._further(done, min(_SPARE // work - self.count, _MORE * self.count))
+        done = self._further(self.done, min(self._spare - self.count, _MORE * self.count))
+        return self._answer(done)
+
+    def finer(self, found: LinearAnswer) -> SplitAnswer | None:
+        """The proof that meets the target for the whole, with the worst cells halved; None where that gives no less."""
+        seen = _Seen(
+            run=self.whole, fit=self.whole.engine.correction, hint=_Hint(self.whole.hoped, self.whole.learnt),
+            promising=True, found=(found.outcome, found.shown), side=_side(self.whole),
+        )  # fmt: skip
+        spare = min(self._spare - 1, _FEW) if self.wide else 0
+        done = self._further([(self.root, seen)], spare, CLEARLY)
+        return self._answer(done) if len(done) > 1 else None
+
+    @property
+    def _spare(self) -> int:
+        """Cells that may be looked at for less than the target: none where events are dear."""
+        engine = self.whole.engine
+        return 0 if engine.continuous else _SPARE // (engine.pieces * engine.n**2)
+
+    def _answer(self, done: list[_Proof]) -> SplitAnswer:
         done = sorted(done, key=lambda item: item[0].path)
         return SplitAnswer.of([
             (leaf.path, leaf.low, leaf.high, seen.answer(self.problem, leaf, self.pieces)) for leaf, seen in done
         ])
 
-    def _further(self, done: list[_Proof], spare: int) -> list[_Proof]:
-        """The cells with the worst ones halved, while ``spare`` cells may be looked at and that gives less."""
+    def _further(self, done: list[_Proof], spare: int, gain: float = 1.0) -> list[_Proof]:
+        """The cells with the worst ones halved, while ``spare`` cells may be looked at and logarithms ``gain``."""
         while spare >= 2:
             leaf, seen = worst = max(done, key=lambda item: item[1].level)
             if seen.level <= _ENOUGH * self.target.log:
@@ -220,7 +239,7 @@ class Bisection:
             while self.flying:
                 poll()
                 halves += [(half, seen) for half, seen, _ in self._finished()]
-            if max(half.level for _, half in halves) >= seen.level:
+            if max(half.level for _, half in halves) >= gain * seen.level:
                 break
             done = [item for item in done if item is not worst] + halves
             spare -= 2

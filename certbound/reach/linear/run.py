@@ -58,7 +58,7 @@ class LinearRun(Inclusion):
 
     ``hoped`` is the delta_N that promised most, here or in a run much like this one, and ``lost`` the logarithm of the
     largest one at which the remainder could not be enclosed; ``parted``: cells of the starts were tried in vain;
-    ``halving``: what is proved of them so far.
+    ``halving``: what is proved of them so far; ``beyond``: what the first share that was too small said.
     """
 
     def __init__(self, engine: Linearisation) -> None:
@@ -67,6 +67,7 @@ class LinearRun(Inclusion):
         self.lost = -np.inf
         self.parted = False
         self.halving: Any = None
+        self.beyond: Outcome | None = None
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[Share, tuple[Array, list[Events]]] = {}
