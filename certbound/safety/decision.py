@@ -25,7 +25,7 @@ from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import arrival, best_time, find_miss, window_of
-from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of
+from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of, in_order
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
@@ -208,8 +208,7 @@ class _Search:
         """Ask one engine after the other; one that takes long is interrupted for those after it."""
         if not names:
             return
-        turn: list[bool] = []
-        patience = _PATIENCE * self.watch.left
+        names, turn, patience = in_order(names, self.problem, self.answers), [], _PATIENCE * self.watch.left
         surely = 1 <= self._chance(names[0]) < math.inf
         share = _TURN if any(map(self._likely, names[1:])) or not self._likely(names[0]) else _LAST
 

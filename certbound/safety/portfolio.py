@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from certbound.problem.problem import Problem
@@ -193,6 +193,17 @@ def engines_of(method: str) -> tuple[str, ...]:
     near = difflib.get_close_matches(str(method), known, n=1)
     cure = f"did you mean {near[0]!r}?" if near else "leave it out for the best of all engines."
     raise ValueError(f"`method` must be one of {', '.join(known)}, got {method!r}; {cure}")
+
+
+def in_order(names: tuple[str, ...], problem: Problem, answers: Mapping[str, EngineAnswer]) -> tuple[str, ...]:
+    """The engines that are left to be asked: last those that repeat what another one has just tried in vain.
+
+    That is to meet a target of an infinite horizon at one time, in discrete time: it can be met at any other as well.
+    """
+    vain = any(answer.hit is not None and answer.applicable and answer.log10_delta == 0 for answer in answers.values())
+    if not (vain and problem.endless and problem.system.time == "discrete"):
+        return names
+    return tuple(sorted(names, key=lambda name: not ENGINES[name].reaches))
 
 
 def check_request(problem: Problem, request: Request) -> None:

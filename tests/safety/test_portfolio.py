@@ -10,8 +10,9 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
+from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_data, problem_data
-from certbound.safety.portfolio import ENGINES, engine_named
+from certbound.safety.portfolio import ENGINES, engine_named, in_order
 from certbound.safety.verdict import best_lower
 from certbound.safety.verification import verify_safety
 from tests.zoo import ZOO
@@ -126,3 +127,14 @@ def test_bounds_that_cross_answer_nothing_either_where_both_are_above_delta() ->
         verdict_of(ZOO["decay"](0.5, 1.0), {"linear": above, "values": below})
     assumed = EngineAnswer(log10_delta=-1.0, assumption="the stated constants hold")
     assert verdict_of(ZOO["decay"](0.5, 1.0), {"linear": assumed, "values": below}).log10_lower == -0.9
+
+
+def test_what_was_tried_in_vain_at_one_time_is_not_tried_again_before_all_times_are() -> None:
+    names = tuple(ENGINES)
+    system = cb.DiscreteSystem(lambda x: 0.9 * x, states=1, noise=cb.Gaussian(std=0.3))
+    safe, reach = [cb.Inside(cb.Box([-3], [3]))], cb.Box([-0.2], [0.2])
+    endless = cb.Problem(system, initial=[1.0], safe=safe, reach=reach, horizon=np.inf)
+    vain, partly = (EngineAnswer(log10_delta=level, hit=9.0) for level in (0.0, -0.1))
+    assert in_order(names, endless, {"linear": vain})[:2] == ("values", "linear")
+    assert in_order(names, endless, {"linear": partly}) == names
+    assert in_order(names, endless.replace(horizon=9), {"linear": vain}) == names

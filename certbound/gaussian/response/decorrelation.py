@@ -61,6 +61,7 @@ def _pairs(f: Array, phi: Array) -> Iterator[_Pairs]:
     size = np.abs(f).sum(axis=2).max(axis=1) + n * phi
     matrix, error = np.zeros((0, n, n)), np.zeros(0)
     held: list[tuple[int, Array, Array]] = []
+    waiting = 0
     for b in range(1, count + 1):
         poll()
         norm = np.abs(matrix).max(axis=(1, 2), initial=0.0)
@@ -68,13 +69,14 @@ def _pairs(f: Array, phi: Array) -> Iterator[_Pairs]:
         matrix = np.concatenate([f[b - 1] @ matrix, f[b - 1][None]])
         error = np.append(later, phi[b - 1])
         held.append((b, matrix, error))
-        if b == count or sum(len(e) for _, _, e in held) * n * n > _BATCH:
+        waiting += len(error)
+        if b == count or waiting * n * n > _BATCH:
             yield _Pairs(
                 a=np.concatenate([np.arange(len(e)) for _, _, e in held]),
                 b=np.concatenate([np.full(len(e), k) for k, _, e in held]),
                 matrix=np.concatenate([m for _, m, _ in held]), error=np.concatenate([e for _, _, e in held]),
             )
-            held = []
+            held, waiting = [], 0
 
 
 @quiet

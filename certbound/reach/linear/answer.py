@@ -11,9 +11,21 @@ import numpy as np
 from certbound.problem.held import HeldLoop
 from certbound.problem.problem import Problem
 from certbound.reach.linear import shares
-from certbound.reach.linear.bisection import Bisection
+from certbound.reach.linear.bisection import CLEARLY, Bisection
 from certbound.reach.linear.diffusion import DiffusionRun, depends_on_state
-from certbound.reach.linear.hopes import best_of, coarser, hopes_of, least, nobody, nobody_waits, refined, run_of, tried
+from certbound.reach.linear.hopes import (
+    afterwards,
+    best_of,
+    coarser,
+    gains_by_halves,
+    hopes_of,
+    least,
+    nobody,
+    nobody_waits,
+    refined,
+    run_of,
+    tried,
+)
 from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
@@ -85,7 +97,11 @@ def linear_answer(
     best = refined(run, best, effort, target, lambda o: found(LinearAnswer(run=run, outcome=o, shown=shown)))
     if first is not None and first.outcome.log_probability < best.log_probability:
         return first
-    return LinearAnswer(run=run, outcome=best, shown=shown)
+    answer = LinearAnswer(run=run, outcome=best, shown=shown)
+    if cells is None and plain and not (quick or run.engine.continuous) and gains_by_halves(run, best, CLEARLY):
+        with afterwards(), Bisection.of(run, target, met=True) as parts:
+            return parts.finer(answer) or answer
+    return answer
 
 
 def _on_coarse_grids(

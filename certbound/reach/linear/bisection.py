@@ -9,6 +9,7 @@ Where even its middle alone, as a start, is out of reach, no halving helps.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,10 +30,14 @@ from certbound.rigor.intervals import Interval
 from certbound.watch import executor_lent, jobs_allowed, poll
 
 _DEPTH = 4  # halvings of every side
+_BEYOND = 2  # halvings more than make as many equal cells as may be looked at, after which a cell is hopeless
 _LOOK = 3  # halvings between two looks at the middle of a cell
 _MOST_PIECES = 16_000  # pieces of time times cells that are looked at
 _SPARE = 4_000  # cells times steps times squared states that may be spent on less than the target
+_FEW = 8  # cells for less than the target where the whole meets it
 _MORE = 2  # times the cells that the target took, at most
+CLEARLY = 1.25
+"""How many times as large the logarithm must become where the whole meets the target and is halved for less."""
 _ENOUGH = 10.2  # times its logarithm, beyond which less is worth nothing
 
 
@@ -141,6 +146,8 @@ class Bisection:
         self.root = _Leaf(np.array(boxes.lo[0]), np.array(boxes.hi[0]))
         self.middle = self.root.middle
         self.wide = int(np.count_nonzero(self.root.low < self.root.high))
+        equal = math.log2(max(_MOST_PIECES / whole.engine.pieces, 1.0))
+        self.deepest = min(_DEPTH * self.wide, math.ceil(equal) + _BEYOND)
         self.open: dict[_Leaf, tuple[float, _Hint]] = {self.middle: (np.inf, _Hint())} if self.wide else {}
         self.done: list[_Proof] = []
         self.count = 1
@@ -149,14 +156,14 @@ class Bisection:
 
     @classmethod
     @contextlib.contextmanager
-    def of(cls, whole: LinearRun, target: Share) -> Iterator[Bisection]:
-        """With as many processes as are allowed; what time ended goes on where it was."""
+    def of(cls, whole: LinearRun, target: Share, *, met: bool = False) -> Iterator[Bisection]:
+        """With as many processes as are allowed; what time ended goes on where it was. ``met``: for `finer` only."""
         found: Bisection = whole.halving or cls(whole, target)
         whole.halving = found
         asked = partial(_look, found.problem, found.pieces, target)
         with staff(asked, jobs_allowed(), executor_lent()) as found.workers:
             found.flying = {}
-            if found.workers.apart and found.middle in found.open:
+            if found.workers.apart and found.middle in found.open and not met:
                 found._ask(found.middle)
             yield found
 
@@ -178,7 +185,7 @@ class Bisection:
             poll(f"cells of the initial set: {len(self.done)} done, {len(self.open)} to do")
             while len(self.flying) < min(self.workers.width, len(self.open)):
                 waiting = (leaf for leaf in self.open if leaf not in self.flying)
-                self._ask(most := max(waiting, key=lambda leaf: self.open[leaf][0]), proving=most is not self.middle)
+                self._ask(most := max(waiting, key=self._first), proving=most is not self.middle)
             for leaf, seen, looked in self._finished():
                 if looked and leaf is not self.middle and (seen.promising or self._lost):
                     continue
@@ -186,7 +193,7 @@ class Bisection:
                 if seen.found is not None:
                     self.done.append((leaf, seen))
                 elif leaf is not self.middle:
-                    if seen.hopeless or len(leaf.path) >= _DEPTH * self.wide:
+                    if seen.hopeless or len(leaf.path) >= self.deepest:
                         return None
                     self.open |= dict.fromkeys(leaf.halves(seen.side), (seen.urgency, seen.hint))
                     self.count += 2
@@ -194,17 +201,33 @@ class Bisection:
                     return None
             if self.count * self.whole.engine.pieces > _MOST_PIECES:
                 return None
-        done = self.done
-        if not self.whole.engine.continuous:  # elsewhere events are dear
-            work = self.whole.engine.pieces * self.whole.engine.n**2
-            done = self._further(done, min(_SPARE // work - self.count, _MORE * self.count))
+        done = self._further(self.done, min(self._spare - self.count, _MORE * self.count))
+        return self._answer(done)
+
+    def finer(self, found: LinearAnswer) -> SplitAnswer | None:
+        """The proof that meets the target for the whole, with the worst cells halved; None where that gives no less."""
+        seen = _Seen(
+            run=self.whole, fit=self.whole.engine.correction, hint=_Hint(self.whole.hoped, self.whole.learnt),
+            promising=True, found=(found.outcome, found.shown), side=_side(self.whole),
+        )  # fmt: skip
+        spare = min(self._spare - 1, _FEW) if self.wide else 0
+        done = self._further([(self.root, seen)], spare, CLEARLY)
+        return self._answer(done) if len(done) > 1 else None
+
+    @property
+    def _spare(self) -> int:
+        """Cells that may be looked at for less than the target: none where events are dear."""
+        engine = self.whole.engine
+        return 0 if engine.continuous else _SPARE // (engine.pieces * engine.n**2)
+
+    def _answer(self, done: list[_Proof]) -> SplitAnswer:
         done = sorted(done, key=lambda item: item[0].path)
         return SplitAnswer.of([
             (leaf.path, leaf.low, leaf.high, seen.answer(self.problem, leaf, self.pieces)) for leaf, seen in done
         ])
 
-    def _further(self, done: list[_Proof], spare: int) -> list[_Proof]:
-        """The cells with the worst ones halved, while ``spare`` cells may be looked at and that gives less."""
+    def _further(self, done: list[_Proof], spare: int, gain: float = 1.0) -> list[_Proof]:
+        """The cells with the worst ones halved, while ``spare`` cells may be looked at and logarithms ``gain``."""
         while spare >= 2:
             leaf, seen = worst = max(done, key=lambda item: item[1].level)
             if seen.level <= _ENOUGH * self.target.log:
@@ -216,11 +239,15 @@ class Bisection:
             while self.flying:
                 poll()
                 halves += [(half, seen) for half, seen, _ in self._finished()]
-            if max(half.level for _, half in halves) >= seen.level:
+            if max(half.level for _, half in halves) >= gain * seen.level:
                 break
             done = [item for item in done if item is not worst] + halves
             spare -= 2
         return done
+
+    def _first(self, leaf: _Leaf) -> tuple[float, int]:
+        """What needs most halvings comes first, of that what has most: it fails first."""
+        return self.open[leaf][0], len(leaf.path)
 
     @property
     def _lost(self) -> bool:

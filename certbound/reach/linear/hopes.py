@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 
 import numpy as np
 
@@ -147,22 +148,41 @@ def least(first: Outcome, second: Outcome) -> Outcome:
     return second if second.log_probability < first.log_probability else first
 
 
+def afterwards() -> AbstractContextManager[None]:
+    """What goes on once the target is met: a limit of time leaves it a part of what that took."""
+    return in_proportion(_FURTHER, _BRIEFLY)
+
+
+def gains_by_halves(run: LinearRun, best: Outcome, gain: float) -> bool:
+    """Whether the share that gave less than ``best``, as the remainder grew, is likely to do on halves of the starts.
+
+    What the starts take of the room is halved then; the remainder's part, which falls as well, is left as it is.
+    """
+    beyond = run.beyond
+    if beyond is None or beyond.bounds is None or beyond.nonlinear.log > gain * best.log_probability:
+        return False
+    rooms, support = run.rooms(beyond.cell, beyond.bounds), run.supports[beyond.cell]
+    rooms = rooms + 0.5 * support.y[:, run.inner :]
+    events = run.kept[beyond.nonlinear][1][beyond.cell]
+    asked = run.requirements[beyond.cell]
+    return all(
+        events.along(one.rows).log_exceedance(rooms[:, i]) <= gain * best.log_probability for i, one in enumerate(asked)
+    )
+
 
 def refined(
     run: LinearRun, best: Outcome, effort: int, target: Share, found: Callable[[Outcome], object] = lambda outcome: None
 ) -> Outcome:
-    """A smaller probability, where the levels cost most of what was proved: with smaller and smaller shares.
-
-    The target is met already, so that a limit of time leaves this a part of what it took.
-    """
+    """A smaller probability, where the levels cost most of what was proved: with smaller and smaller shares."""
     above = best.log_probability - best.nonlinear.log
     if best.log_probability > target.log or above <= -3.0 or (above >= 2.0 and not run.curved):
         return best
     coupled = max((len(group[0]) for group in run.engine.model.blocks), default=1) > 1
-    with in_proportion(_FURTHER, _BRIEFLY):
+    with afterwards():
         for _ in range(0 if coupled or len(run.engine.model.active) > _MANY else _REFINEMENTS):
             outcome = run.probability(Share(2 * best.nonlinear.log), effort)
             if outcome.log_probability >= best.log_probability:
+                run.beyond = outcome
                 break
             best = outcome
             found(best)

@@ -58,7 +58,7 @@ class LinearRun(Inclusion):
 
     ``hoped`` is the delta_N that promised most, here or in a run much like this one, and ``lost`` the logarithm of the
     largest one at which the remainder could not be enclosed; ``parted``: cells of the starts were tried in vain;
-    ``halving``: what is proved of them so far.
+    ``halving``: what is proved of them so far; ``beyond``: what the first share that was too small said.
     """
 
     def __init__(self, engine: Linearisation) -> None:
@@ -67,6 +67,7 @@ class LinearRun(Inclusion):
         self.lost = -np.inf
         self.parted = False
         self.halving: Any = None
+        self.beyond: Outcome | None = None
         self.memory: dict[int, dict[bytes, Any]] = {}
         self.steps: dict[int, StepEvents] = {}
         self.kept: dict[Share, tuple[Array, list[Events]]] = {}
@@ -168,7 +169,7 @@ class LinearRun(Inclusion):
         worst = -np.inf
         for cell in range(len(self.supports)):
             poll(self.phase("a guess of the probability", cell))
-            worst = max(worst, self._cell(cell, guess, events[cell], nonlinear).log_probability)
+            worst = max(worst, self._cell(cell, guess, events[cell], nonlinear, limit).log_probability)
             if worst > limit:
                 break
         return worst
@@ -199,7 +200,10 @@ class LinearRun(Inclusion):
             left = room - used - 4e-16 * (np.abs(room) + np.abs(used))
         return np.asarray(np.where(np.isinf(room), np.inf, left))
 
-    def _cell(self, cell: int, bounds: tuple[Array, Array], events: Events, nonlinear: Share) -> Outcome:
+    def _cell(
+        self, cell: int, bounds: tuple[Array, Array], events: Events, nonlinear: Share, limit: float = 0.0
+    ) -> Outcome:
+        """What the bounds leave to the events; in continuous time no more than that it is beyond ``limit``."""
         rooms = self.rooms(cell, bounds)
         shared = nonlinear.log if self.curved else events.shared_log
         asked = self.requirements[cell]
@@ -208,6 +212,8 @@ class LinearRun(Inclusion):
         for i, event in enumerate(along):
             poll(self.phase("probability of leaving", cell))
             logs.append(event.log_exceedance(rooms[:, i]))
+            if self.curved and not isinstance(events, StepEvents) and limit < logsumexp(np.array([shared, *logs])):
+                break
         if isinstance(events, StepEvents) and events.gaussian:
             logs = [self._entered(cell, r, log, bounds) for r, log in zip(asked, logs, strict=True)]
         total = logsumexp(np.array([shared, *logs]))

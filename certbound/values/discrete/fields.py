@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +33,10 @@ FINENESS = 6.0
 _MOST_POINTS = 6_000_000
 _UNIT = 2.0**-53
 _DECAY = 34.5  # -log of the trapezoidal rule's error
+
+
+Part = tuple[tuple[str, ...], Array]
+"""One basis function for every axis, and its coefficients."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -224,51 +228,42 @@ class Tables:
 
     def _raw(self, value: ValueFunction, order: int) -> dict[tuple[int, ...], Array]:
         """Sums over the grid of what the parts of the function contribute, and what lies outside."""
-        raw: dict[tuple[int, ...], Array] = {}
-
-        def add(names: list[str], tensor: Array, sign: float) -> None:
-            for alpha, part in self._contract(names, tensor, order):
-                raw[alpha] = raw[alpha] + sign * part if alpha in raw else sign * part
-
-        add(["hat"] * self.n, value.nodal, 1.0)
-        for i in range(self.n):
-            if np.any(value.bend[i]):
-                add(["bubble" if k == i else "whole" for k in range(self.n)], value.bend[i], -1.0)
-        if value.fixed is not None:
-            self._add_fixed(value, add)
+        raw = self._contract(self._parts(value), order)
         if value.beyond:
             for alpha, part in self._outside(order):
                 raw[alpha] = raw[alpha] + value.beyond * part
         return raw
 
-    def _add_fixed(self, value: ValueFunction, add: Callable[[list[str], Array, float], None]) -> None:
-        """On fixed cells: the constant instead of the multilinear part."""
-        assert value.fixed is not None
-        places = [
-            np.flatnonzero(np.any(value.fixed, axis=tuple(k for k in range(self.n) if k != i))) for i in range(self.n)
-        ]
-        if not len(places[0]):
-            return
-        window = tuple(slice(int(p[0]), int(p[-1]) + 1) for p in places)
-        for sides, part in zip(itertools.product(("left", "right"), repeat=self.n), corners(value.nodal)):
-            gap = np.where(value.fixed, value.level - part, 0.0)
-            if np.any(gap):
-                whole = np.zeros_like(gap)
-                whole[window] = gap[window]
-                add(list(sides), whole, 1.0)
+    def _parts(self, value: ValueFunction) -> list[Part]:
+        """The function as a sum: the multilinear part, on fixed cells the constant instead, and parabolas."""
+        names: list[tuple[str, ...]] = [("hat",) * self.n]
+        found = [value.nodal]
+        if value.fixed is not None and value.fixed.any():
+            names = list(itertools.product(("left", "right"), repeat=self.n))
+            found = [np.where(value.fixed, value.level, corner) for corner in corners(value.nodal)]
+        for i in range(self.n):
+            if np.any(value.bend[i]):
+                names.append(tuple("bubble" if k == i else "whole" for k in range(self.n)))
+                found.append(-value.bend[i])
+        return list(zip(names, found, strict=True))
 
-    def _contract(self, names: list[str], tensor: Array, order: int) -> list[tuple[tuple[int, ...], Array]]:
-        """All derivatives up to the order of one tensor against one basis function an axis."""
-        parts: list[tuple[tuple[int, ...], Array]] = [((), tensor)]
-        for axis, name in enumerate(names):
-            found = []
-            for alpha, part in parts:
-                left = order - sum(alpha)
-                moved = np.moveaxis(part, axis, 0)
-                for a, table in enumerate(self.kernels[axis].apply(name, moved, left + 1)):
-                    found.append(((*alpha, a), np.moveaxis(table, 0, axis)))
-            parts = found
-        return parts
+    def _contract(self, parts: list[Part], order: int) -> dict[tuple[int, ...], Array]:
+        """All derivatives up to the order of a sum of tensors, each against one basis function an axis.
+
+        Axis by axis: what has the same basis functions along all later axes is added up before them.
+        """
+        sums = {((), names): tensor for names, tensor in parts}
+        for axis, kernel in enumerate(self.kernels):
+            found: dict[Any, Array] = {}
+            for (alpha, (name, *rest)), tensor in sums.items():
+                for a, table in enumerate(kernel.apply(name, tensor, axis, order - sum(alpha) + 1)):
+                    key = (*alpha, a), tuple(rest)
+                    if key in found:
+                        found[key] += table
+                    else:
+                        found[key] = table
+            sums = found
+        return {alpha: table for (alpha, _), table in sums.items()}
 
     def _outside(self, order: int) -> list[tuple[tuple[int, ...], Array]]:
         """Derivatives of the probability of landing outside the grid: out_1 + in_1 out_2 + in_1 in_2 out_3."""

@@ -109,9 +109,12 @@ def values_above(transition: AnyTransition, *values: ValueFunction) -> tuple[Arr
 
 def nodes_below(transition: AnyTransition, *values: ValueFunction, **options: Any) -> list[Array]:
     """Node values at most phi, one array for each disturbance that is tried."""
+    return _least_at_nodes(transition, [transition.tables.field(value, **options) for value in values])
+
+
+def _least_at_nodes(transition: AnyTransition, fields: list[Any]) -> list[Array]:
     found: list[Array] = []
-    for value in values:
-        field: Any = transition.tables.field(value, **options)
+    for field in fields:
         least = [at - error for at, error in transition.at_nodes(field)]
         found = [a + b - _SUM * np.abs(a + b) for a, b in zip(found, least, strict=True)] if found else least
     return found
@@ -120,9 +123,10 @@ def nodes_below(transition: AnyTransition, *values: ValueFunction, **options: An
 def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones, *more: ValueFunction) -> ValueFunction:
     """A function at most V_t, given one that is at most V_{t+1}, or several whose sum is."""
     grid = transition.step.grid
-    options = nodes_below(transition, value, *more)
+    fields: list[Any] = [transition.tables.field(one) for one in (value, *more)]
+    options = _least_at_nodes(transition, fields)
     nodal = options[0] if len(options) == 1 else _policy(options)
-    bends = [_bends(transition, transition.tables.field(one), above=False) for one in (value, *more)]
+    bends = [_bends(transition, field, above=False) for field in fields]
     bend, known = np.sum([found[0] for found in bends], axis=0), np.all([found[2] for found in bends], axis=0)
     bend = bend + _SUM * np.abs(bend) if more else bend
     nodal, holes = _without_holes(nodal, 0.0)

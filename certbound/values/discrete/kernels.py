@@ -72,16 +72,23 @@ class AxisKernel:
     outside: Array = field(repr=False)
     outside_mass: Array = field(repr=False)
 
-    def apply(self, name: str, tensor: Array, orders: int = ORDERS) -> list[Array]:
-        """Contract the first axis of a tensor with the first ``orders`` derivatives of one basis' matrix."""
-        flat = tensor.reshape(len(tensor), -1)
-        found = np.empty((orders, len(self.points), flat.shape[1]))
+    def apply(self, name: str, tensor: Array, axis: int, orders: int = ORDERS) -> list[Array]:
+        """Contract one axis of a tensor with the first ``orders`` derivatives of one basis' matrix."""
+        before, after = tensor.shape[:axis], tensor.shape[axis + 1 :]
+        flat = np.ascontiguousarray(tensor).reshape(math.prod(before), tensor.shape[axis], math.prod(after))
+        found = np.empty((orders, len(flat), len(self.points), flat.shape[2]))
         for block in self.blocks:
             part = block.parts[name][:orders]
-            rows = part.shape[1]
-            columns = flat[block.left : block.left + part.shape[2]]
-            found[:, block.first : block.last] = (part.reshape(orders * rows, -1) @ columns).reshape(orders, rows, -1)
-        return list(found.reshape(orders, len(self.points), *tensor.shape[1:]))
+            columns, into = flat[:, block.left : block.left + part.shape[2]], found[:, :, block.first : block.last]
+            if axis == 0:
+                np.matmul(part, columns[0], out=into[:, 0])
+                continue
+            for matrix, place in zip(part, into):
+                if after:
+                    np.matmul(matrix, columns, out=place)
+                else:
+                    np.matmul(columns[:, :, 0], matrix.T, out=place[:, :, 0])
+        return list(found.reshape(orders, *before, len(self.points), *after))
 
     def apply_mass(self, tensor: Array) -> Array:
         """Contract the first axis of a tensor over the intervals with the dominating masses."""

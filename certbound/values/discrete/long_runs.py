@@ -45,6 +45,7 @@ _MOST = 20_000  # steps back on one grid
 _LOST = 1e-3  # of the largest probability of being safe: cells with less are rounded
 _SOON, _AT_LEAST, _NEGLIGIBLE = 32, 1024, 1e-17
 _BETTER = 0.9  # of the gap: what twice as many steps back have to make of it
+_DEAR, _BRIEF = 3, 2.0  # states from which on a step back is dear, and seconds at fixed rates of those that matter
 _CHECKED = 1.2  # steps back between two looks at the bounds, as a ratio
 
 
@@ -95,7 +96,8 @@ def bound_long_run(
         if tried and run.steps * cost > left:
             break
         try:
-            found = run.bounds(layout[-1], share, ratio, left / cost)
+            brief = (delta or 0.0, _BRIEF / cost if run.work.n >= _DEAR else math.inf)
+            found = run.bounds(layout[-1], share, ratio, left / cost, brief)
         except (Inapplicable, OutOfTime):
             if best is None:
                 raise
@@ -199,8 +201,13 @@ class _Run:
         self.first = 0 if self.work.random else 1
         self.steps = 0
 
-    def bounds(self, grid: Grid, share: float, ratio: float, most: float) -> FailureBounds:
-        """The bounds on one grid, after so many steps back that more would not change much."""
+    def bounds(
+        self, grid: Grid, share: float, ratio: float, most: float, brief: tuple[float, float]
+    ) -> FailureBounds:
+        """The bounds on one grid, after so many steps back that more would not change much.
+
+        They need not be closer than asked where the probability ``brief[0]`` holds after ``brief[1]`` steps or more.
+        """
         best: FailureBounds | None = None
         ahead, look, gap = self.horizon - self.first, 4.0, (0, math.inf)
         zones = self.work.zones(grid, 0)
@@ -216,7 +223,8 @@ class _Run:
                 best, self.steps = found if best is None else _better(best, found), n
                 wide, twice = _gap(best), n >= 2 * gap[0]
                 vain = twice and self._stalls(best, n) and wide > _BETTER * gap[1]
-                if last or vain or wide <= (ratio - 1) / 4:
+                answered = best.upper <= brief[0] and n >= brief[1]
+                if last or vain or wide <= (ratio - 1) / (1 if answered else 4):
                     break
                 gap = (n, wide) if twice else gap
             above, below = back_above(transition, above, zones), back_below(transition, below, zones)

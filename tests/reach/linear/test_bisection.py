@@ -138,6 +138,37 @@ def test_a_smaller_set_of_starts_is_never_worse(split: SplitAnswer) -> None:
     assert linear_answer(flattening(reach=0.6)).log10_delta <= -3
 
 
+def square(reach: float, std: float) -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: 0.9 * x + 0.1 * x**2, states=1, noise=cb.Gaussian(std=std))
+    safe = [cb.Inside(cb.Box([-1.05], [1.05]))]
+    return cb.Problem(system, initial=cb.Box([-reach], [reach]), safe=safe, horizon=6, delta=1e-3)
+
+
+def test_what_meets_the_target_is_halved_where_that_gives_clearly_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = square(0.7, 0.015)
+    whole, found = linear_answer(problem, cells=1), linear_answer(problem, thorough=False)
+    assert isinstance(found, SplitAnswer)
+    assert found.log10_delta < 1.25 * whole.log10_delta
+    assert (found.low.min(), found.high.max()) == (-0.7, 0.7)
+    monkeypatch.setattr(bisection, "_look", None)
+    assert linear_answer(problem, thorough=False, quick=True).log10_delta == whole.log10_delta
+    assert linear_answer(square(0.3, 0.015), thorough=False).log10_delta < -30
+
+
+def test_a_cell_is_hopeless_beyond_the_grid_that_may_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    original = bisection._look
+
+    def look(*args: Any) -> Any:
+        seen.append(len(args[3].path))
+        return original(*args)
+
+    monkeypatch.setattr(bisection, "_look", look)
+    monkeypatch.setattr(bisection, "_BEYOND", -11)  # of 6 steps the grid has 2**12 cells at most
+    assert linear_answer(flattening()).log10_delta > -3
+    assert max(seen) == 1
+
+
 def test_a_grid_that_is_asked_for_is_kept() -> None:
     found = linear_answer(flattening(), cells=8)
     assert not isinstance(found, SplitAnswer)

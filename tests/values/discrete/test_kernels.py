@@ -36,7 +36,7 @@ def test_every_entry_is_the_integral(kernel: AxisKernel, name: str, order: int) 
     for k in range(len(NODES) - 1):
         unit = np.zeros(len(NODES) - 1)
         unit[k] = 1.0
-        found = kernel.apply(name, unit)[order]
+        found = kernel.apply(name, unit, 0)[order]
         mass = norm.cdf((NODES[k + 1] - POINTS) / SIGMA / KAPPA) - norm.cdf((NODES[k] - POINTS) / SIGMA / KAPPA)
         bound = kernel.error * SIGMA**-order * mass + 1e-20 * SIGMA**-order
         assert np.all(np.abs(found - reference(name, k, order)) <= bound + 1e-13 * np.abs(reference(name, k, order)))
@@ -44,7 +44,7 @@ def test_every_entry_is_the_integral(kernel: AxisKernel, name: str, order: int) 
 
 
 def test_hats_and_the_outside_make_up_everything(kernel: AxisKernel) -> None:
-    ones = kernel.apply("hat", np.ones(len(NODES)))
+    ones = kernel.apply("hat", np.ones(len(NODES)), 0)
     for order, total in enumerate((1.0, 0.0, 0.0)):
         assert ones[order] + kernel.outside[order] == pytest.approx(total, abs=1e-11)
     inside = norm.cdf((NODES[-1] - POINTS) / SIGMA) - norm.cdf((NODES[0] - POINTS) / SIGMA)

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 
 import certbound as cb
 from certbound.errors import InfeasibleError
-from certbound.values.discrete import bound_failure, bound_long_run
+from certbound.values.discrete import bound_failure, bound_long_run, long_runs
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.long_runs import largest_rate, least_rate
 from certbound.values.grids import Grid
@@ -82,6 +82,14 @@ def test_for_ever_a_target_is_met_or_missed():
     missed = np.linalg.solve(np.eye(len(x)) - kernel, over)
     truth = density(x + 0.05, 0.3) * w @ missed + 0.5 * math.erfc(1.05 / (0.3 * math.sqrt(2)))
     assert found.lower <= truth <= found.upper <= 1.1 * found.lower
+
+
+def test_where_steps_are_dear_they_end_once_delta_holds(monkeypatch):
+    monkeypatch.setattr(long_runs, "_DEAR", 1)
+    monkeypatch.setattr(long_runs, "_BRIEF", 0.0)
+    brief, whole = (bound_long_run(walk(), seconds=0.1, delta=delta, ratio=1.3) for delta in (0.9, 1e-6))
+    assert brief.before[0] < whole.before[0]
+    assert brief.lower <= whole.lower <= whole.upper <= brief.upper < 1.36 * brief.lower
 
 
 def test_two_states_for_ever():

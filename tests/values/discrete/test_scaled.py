@@ -62,7 +62,7 @@ def test_rows_with_deviations_of_their_own_are_those_of_one_kernel_each() -> Non
     for k in range(3):
         alone = axis_kernel(points[k : k + 1], nodes, float(sizes[k]), 1e-15)
         for name in ("left", "bubble"):
-            for one, other in zip(alone.apply(name, values), together.apply(name, values, 5)):
+            for one, other in zip(alone.apply(name, values, 0), together.apply(name, values, 0, 5)):
                 assert other[k] == pytest.approx(one[0], rel=1e-9, abs=1e-11)
         assert together.outside[:3, k] == pytest.approx(alone.outside[:, 0], rel=1e-9, abs=1e-12)
     fine = np.linspace(0, 1, 400_001)
@@ -70,7 +70,7 @@ def test_rows_with_deviations_of_their_own_are_those_of_one_kernel_each() -> Non
     for order in (3, 4):
         hermite = np.polynomial.hermite_e.hermeval(z, [0] * order + [1])
         exact = np.trapezoid(hermite * norm.pdf(z) / sizes ** (order + 1), fine, axis=0)
-        assert together.apply("whole", np.ones(8), 5)[order] == pytest.approx(exact, rel=1e-6, abs=1e-6)
+        assert together.apply("whole", np.ones(8), 0, 5)[order] == pytest.approx(exact, rel=1e-6, abs=1e-6)
         assert together.outside[order] == pytest.approx(-exact, rel=1e-6, abs=1e-6)
 
 

@@ -24,7 +24,7 @@ from certbound.arrays import Array, Integers, Mask
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import product_error
 from certbound.values.discrete.dominance import dominance
-from certbound.values.discrete.fields import Tables, orders_up_to
+from certbound.values.discrete.fields import Part, Tables, orders_up_to
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.kernels import AxisKernel, axis_kernel
 from certbound.values.discrete.scaled.scaled_motion import Alpha, Jets, ScaledDynamics, cells_and_nodes
@@ -113,20 +113,18 @@ class ScaledTables(Tables):
             tables=tables, dominant=dominant, error=self.error, floor=floor, largest=largest
         )
 
-    def _add_fixed(self, value: ValueFunction, add: Any) -> None:
-        if np.any(value.fixed) and not self._sided:
+    def _contract(self, parts: list[Part], order: int) -> dict[Alpha, Array]:
+        if not self._sided and any("left" in names for names, _ in parts):
             self._sided = True
             self.kernels = self._kernels()
-        super()._add_fixed(value, add)
-
-    def _contract(self, names: list[str], tensor: Array, order: int) -> list[tuple[Alpha, Array]]:
-        found = np.empty((order + 1, order + 1, len(self.mean)))
+        found = np.zeros((order + 1, order + 1, len(self.mean)))
         for one, two in zip(*(kernel.blocks for kernel in self.kernels), strict=True):
-            first, second = one.parts[names[0]][: order + 1], two.parts[names[1]][: order + 1]
-            window = tensor[one.left : one.left + first.shape[2], two.left : two.left + second.shape[2]]
-            half = (first.reshape(-1, first.shape[2]) @ window).reshape(*first.shape[:2], -1)
-            found[:, :, one.first : one.last] = np.einsum("arl,brl->abr", half, second)
-        return [(alpha, found[alpha]) for alpha in orders_up_to(order, 2)]
+            for names, tensor in parts:
+                first, second = one.parts[names[0]][: order + 1], two.parts[names[1]][: order + 1]
+                window = tensor[one.left : one.left + first.shape[2], two.left : two.left + second.shape[2]]
+                half = (first.reshape(-1, first.shape[2]) @ window).reshape(*first.shape[:2], -1)
+                found[:, :, one.first : one.last] += np.einsum("arl,brl->abr", half, second)
+        return {alpha: found[alpha] for alpha in orders_up_to(order, 2)}
 
     def _outside(self, order: int) -> list[tuple[Alpha, Array]]:
         found = []
