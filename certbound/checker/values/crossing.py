@@ -22,6 +22,7 @@ to have full rank, so that the equation with it has a (weak) solution.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from flint import arb
@@ -41,26 +42,34 @@ class Crossing(Passage):
 
     def lower(self) -> arb:
         """At most the probability of leaving from one of the stated starts, or from a random one."""
-        highest = self._highest()
+        self.lowered(self._highest())
+        return self.crossed([self])
+
+    def lowered(self, highest: float) -> None:
+        """Take off what V exceeds."""
         self.lift = -float(np.nextafter(highest, np.inf)) if not highest <= 0 else 0.0
+
+    def crossed(self, stages: Sequence[Crossing]) -> arb:
+        """The same over stages that follow each other, this one being the first; all are lowered."""
         start = self._level()
-        lam = self._payments(start)
-        times = [arb(float(t)) for t in self.surface.times]
-        steps = [b - a for a, b in itertools.pairwise(times)]
-        paid = sum((arb(float(rate)) * step for rate, step in zip(lam, steps)), arb(0))
-        rest = sum((arb(float(rate)) * step for rate, step in zip(self.eps, steps)), arb(0))
+        slabs = [paid for stage in stages for paid in stage.paid(start)]
+        lam, rest = (sum(parts, arb(0)) for parts in zip(*slabs))
         most = 1 + arb(max(self.levels.q))
         if self.random:
             growth = self.levels.above(arb(self.levels.edges[0]))
-            found = self._mean(lambda low, _: (arb(low) - growth - most * paid).exp(), self._certain)
+            found = self._mean(lambda low, _: (arb(low) - growth - most * lam).exp(), self._certain)
         else:
-            found = (arb(start) - self.levels.above(arb(start)) - most * paid).exp()
-        ceiling = max([self._at_end(), *(self._on(*side) for side in self._harmless_sides())])
+            found = (arb(start) - self.levels.above(arb(start)) - most * lam).exp()
+        ceiling = max(stage.ceiling() for stage in stages)
         if not ceiling < 0:
             return arb(0)
         kept = arb(ceiling).exp()
         left = found - most * arb(start).exp() * rest
         return arb.max((left - kept) / (1 - kept), arb(0)).lower()
+
+    def ceiling(self) -> float:
+        """At least V where a path ends that has not failed."""
+        return max([self._at_end(), *(self._on(*side) for side in self._harmless_sides())])
 
     def _level(self) -> float:
         """At most V(0, .) at the best of the stated starts; of a random one, about what its mean comes to."""

@@ -133,6 +133,10 @@ class Passage:
         """What else the file states."""
         return [] if self.upper_side else ["side"] if self.random else ["side", "starts"]
 
+    def _first(self) -> float:
+        """When it begins."""
+        return 0.0
+
     def _last(self) -> float:
         """When it is over."""
         return self.model.horizon
@@ -144,7 +148,7 @@ class Passage:
         for name, row in [("times", times), *(("axes", axis) for axis in axes)]:
             if len(row) < 2 or not (np.diff(row) > 0).all():
                 raise CertificateError(f"`proof.{name}` must be two or more numbers that rise.")
-        if times[0] != 0 or times[-1] != self._last():
+        if times[0] != self._first() or times[-1] != self._last():
             raise Unproved("the slabs of time do not cover the horizon")
         if (len(times) - 1) * np.prod([len(axis) - 1 for axis in axes]) > MOST_PATCHES:
             raise CertificateError(f"`proof.axes` and `proof.times` must make at most {MOST_PATCHES} patches.")
@@ -157,24 +161,33 @@ class Passage:
         """At least the probability of leaving."""
         self._check_box()
         self.lift = self._missing()
+        return self.followed([self])
+
+    def followed(self, stages: Sequence[Passage]) -> arb:
+        """The same over stages that follow each other, this one being the first; all are lifted."""
         start = self._middle() if self.random else self._at_start()
         if not start < 0:
             return arb(1)
-        lam = self._payments(start)
         total, later, v0 = arb(0), arb(0), arb(start)
-        times = [arb(float(t)) for t in self.surface.times]
-        for k in reversed(range(len(lam))):
-            step = times[k + 1] - times[k]
-            later += arb(float(lam[k])) * step
-            total += arb(float(self.eps[k])) * step * later.exp()
+        for lam, eps in reversed([paid for stage in stages for paid in stage.paid(start)]):
+            later += lam
+            total += eps * later.exp()
         most = self.levels.above(arb(self.levels.edges[0]))
         if self.random:
             found = self._mean(lambda _, high: arb.min((later + most + arb(high)).exp(), arb(1)), lambda *_: True)
         else:
             found = (later + v0 + self.levels.above(v0)).exp()
         found += (v0 + most).exp() * total
-        floor = arb.min(arb(self._at_end()), arb(-_LEAST)).exp()
+        floor = arb.min(arb(stages[-1]._at_end()), arb(-_LEAST)).exp()
         return arb.min((found - floor) / (1 - floor), arb(1)).upper()
+
+    def paid(self, start: float) -> list[tuple[arb, arb]]:
+        """lam and eps of every slab, times its length."""
+        times = [arb(float(t)) for t in self.surface.times]
+        return [
+            (arb(float(lam)) * (b - a), arb(float(eps)) * (b - a))
+            for lam, eps, (a, b) in zip(self._payments(start), self.eps, pairwise(times))
+        ]
 
     def _check_box(self) -> None:
         """The box of the grid lies in the safe set, and the starts in it."""
@@ -183,7 +196,7 @@ class Passage:
         if not SafeSet(self.model, bounded=False).holds(centre, radius):
             raise Unproved("the grid was not shown to lie in the safe set")
         initial = self.model.initial
-        if not self.random and not all(
+        if self._first() == 0 and not self.random and not all(
             low >= a and high <= b for (a, b), low, high in zip(sides, initial.low, initial.high)
         ):
             raise Unproved("the initial set was not shown to lie in the grid")
@@ -221,10 +234,14 @@ class Passage:
 
     def _parts(self, patches: Patches, low: Sequence[Array], high: Sequence[Array]) -> tuple[Array, Array]:
         """Ends of V on the part of every patch of a frozen surface that lies between ``low`` and ``high``."""
+        return self.part_of(patches, low, high).sharp_ends()
+
+    def part_of(self, patches: Patches, low: Sequence[Array], high: Sequence[Array]) -> Batch:
+        """V on these parts, before it is lifted."""
         n = self.model.dimension
         whole = patches.derivative(terms(n + 1, 5 * n), (0,) * (n + 1))
         parts = [self._part(patches, i, low[i], high[i], whole.terms) for i in range(n)]
-        return _substituted(whole, parts).sharp_ends()
+        return _substituted(whole, parts)
 
     def _law(self) -> tuple[Array, Array, Array]:
         """Edges of the parts of the cells of one state, and ends of V(0, .) on each, V being lifted."""

@@ -36,6 +36,8 @@ from certbound.values.continuous.plane import (
 from certbound.values.continuous.room import limits_of, safe_room
 from certbound.values.continuous.surface import Surface
 
+Proposed = tuple[Surface | tuple[Surface, ...], Payment]
+
 _LN10 = math.log(10)
 
 
@@ -52,9 +54,9 @@ class ExitBounds:
     words : str
         What was done.
     seconds : float
-    proposed : tuple of (Surface, Payment)
+    proposed : tuple of (Surface or Surfaces of stages, Payment)
         V of every upper bound that was better than those before, and what it was paid with.
-    proposed_below : tuple of (Surface, Payment)
+    proposed_below : tuple of (Surface or Surfaces of stages, Payment)
         The same of the lower bounds.
     """
 
@@ -62,8 +64,8 @@ class ExitBounds:
     lower: float | None
     words: str
     seconds: float
-    proposed: tuple[tuple[Surface, Payment], ...] = ()
-    proposed_below: tuple[tuple[Surface, Payment], ...] = ()
+    proposed: tuple[Proposed, ...] = ()
+    proposed_below: tuple[Proposed, ...] = ()
 
 
 def bound_exits(
@@ -115,8 +117,8 @@ def bound_exits(
     begin = time.perf_counter()
     _check(problem, target, seconds, most=3)
     model = _model(problem)
-    proposed: Sequence[tuple[Surface, Payment]] = ()
-    below: Sequence[tuple[Surface, Payment]] = ()
+    proposed: Sequence[Proposed] = ()
+    below: Sequence[Proposed] = ()
     if target is not None and problem.system.dimension == 2:
         from certbound.values.continuous.plane import bound_failing
 
@@ -143,7 +145,7 @@ def bound_exits(
         upper, least, words = bound_moving(problem, model, begin + seconds, wanted)
     elif windowed(problem):
         _refuse_random(problem)
-        upper, least, words = bound_windows(problem, model, begin + seconds)
+        upper, least, words, (proposed, below) = bound_windows(problem, model, begin + seconds)
     elif walled(problem) and not (boxed(problem) and led(model)):
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)
