@@ -129,7 +129,7 @@ class Crossing(Passage):
         """The disturbance takes fixed values."""
         return 1 + self.model.dimension
 
-    def _need(self, patches: Patches, eps: Array, start: float, which: Terms, parts: int) -> Array:
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
         low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
         low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
         m = self.levels.least(low, high)
@@ -139,7 +139,7 @@ class Crossing(Passage):
         best = np.full(len(eps), -np.inf)
         for corner in corners:
             pushed = [tm.fixed(which, np.full(len(eps), value)) for value in corner]
-            found = self._balance(patches, inputs + pushed, squares, 1 + m, (1 + m) * 2.0**-52).sharp_ends(parts)[0]
+            found = self._balance(patches, inputs + pushed, squares, 1 + m, (1 + m) * 2.0**-52).sharp_ends()[0]
             best = np.where(np.isfinite(found), np.maximum(best, found), best)
         if len(corners) > 1:
             best = np.where(has_full_rank(squares), best, -np.inf)

@@ -13,11 +13,13 @@ absolute terms (a patch has at most 144 data, and each a dozen operations).
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from certbound.checker.values.batches import Array, Batch, Index, Terms
+from certbound.checker.values.batches import Array, Batch, Index, Terms, variable
 
 _ROUNDING = 400 * 2.0**-53
 _UP = 1 + 2.0**-40
@@ -90,15 +92,36 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """P patches: ``low`` and ``high`` of shape (1 + n, P), time first, and the data, shape (4, 6[, 6], P)."""
+    """P patches: ``low`` and ``high`` of shape (1 + n, P), time first, and the data, shape (4, 6[, 6], P).
+
+    Models of V are of one of ``parts`` equal parts of every patch along every axis, by its numbers.
+    """
 
     low: Array
     high: Array
     data: Array
+    parts: int = 1
+    numbers: tuple[int, ...] = ()
 
     def take(self, places: Index | slice) -> Patches:
         """Some of the patches."""
-        return Patches(self.low[:, places], self.high[:, places], self.data[..., places])
+        return Patches(self.low[:, places], self.high[:, places], self.data[..., places], self.parts, self.numbers)
+
+    def cut(self, parts: int) -> Iterator[Patches]:
+        """All equal parts, ``parts`` (a power of 2) along every axis."""
+        for numbers in itertools.product(range(parts), repeat=len(self.low)):
+            yield replace(self, parts=parts, numbers=numbers)
+
+    def variable(self, which: Terms, axis: int) -> Batch:
+        """Time or a state."""
+        found = variable(which, axis, self.low[axis], self.high[axis])
+        if self.parts == 1:
+            return found
+        middle, half = found.value, found.coefficients[1 + axis]
+        offset = half * ((2 * self.numbers[axis] + 1) / self.parts - 1)
+        found.coefficients[0] = middle + offset
+        found.coefficients[1 + axis] = half / self.parts
+        return Batch(which, found.coefficients, found.error + (np.abs(middle) + np.abs(half)) * 2.0**-51)
 
     def derivative(self, which: Terms, orders: tuple[int, ...]) -> Batch:
         """d^orders V, time first, as Taylor models; terms beyond the degree lie in the error."""
@@ -106,6 +129,8 @@ class Patches:
         total, size = self._scaled(half)
         for axis, order in enumerate(orders):
             basis = _derived(IN_TIME if axis == 0 else IN_SPACE, order)
+            if self.parts > 1:
+                basis = _restricted(basis, self.parts, self.numbers[axis])
             total, size = _along(basis, total, axis), _along(np.abs(basis), size, axis)
         factor = np.ones(half.shape[1])
         for axis, order in enumerate(orders):
@@ -147,6 +172,14 @@ def _derived(basis: Array, order: int) -> Array:
     for _ in range(order):
         basis = np.arange(1, len(basis))[:, None] * basis[1:]
     return basis
+
+
+def _restricted(basis: Array, parts: int, number: int) -> Array:
+    """The same by powers of xi' in [-1, 1], xi = c + xi' / parts: exact, as all of it are multiples of a power of 2."""
+    middle, count = (2 * number + 1) / parts - 1, len(basis)
+    rows = [[math.comb(r, s) * middle ** (r - s) / parts**s if s <= r else 0.0 for r in range(count)]
+            for s in range(count)]  # fmt: skip
+    return np.array(rows) @ basis
 
 
 def _along(matrix: Array, array: Array, axis: int) -> Array:

@@ -49,6 +49,8 @@ _FAR = 40.0
 """Standard deviations of a random start beyond the grid that are looked at from below."""
 _DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
 """Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""
+_CUT = {1: ((8, 2),), 2: ((8, 2), (12, 2))}
+"""Degrees on so many parts of a patch along every axis, where no degree served on all of it."""
 _LEAST = 2.0**-20  # V is at least so far below 0 where paths end that have not left, so that exp(V) is not 1
 _ENTRIES = 4_000_000
 _CHUNK = 4096
@@ -308,8 +310,9 @@ class Passage:
             if self.due is not None:  # nothing is asked where paths are over
                 here = np.flatnonzero(np.tile(self.due.ravel(), last - first))
                 patches, slab = patches.take(here), slab[here]
-            for degree, parts in (looks := [*((degree, 1) for degree in self.degrees), (self.degrees[-1], 2)]):
-                need = self._needs(patches, slab, start, degree, parts)
+            for degree, parts in (looks := [*((degree, 1) for degree in self.degrees), *_CUT[self.model.dimension]]):
+                needs = [self._needs(part, slab, start, degree) for part in patches.cut(parts)]
+                need = np.max(needs, axis=0)
                 settled = (need <= self.stated[slab]) | ((degree, parts) == looks[-1])
                 np.maximum.at(lam, slab[settled], need[settled])
                 rest = np.flatnonzero(~settled)
@@ -318,27 +321,27 @@ class Passage:
             raise Unproved("the dynamics was not shown to be defined where V is negative")
         return lam
 
-    def _needs(self, patches: Patches, slab: Index, start: float, degree: int, parts: int) -> Array:
-        """What every patch needs as lam, from Taylor models of some degree, bounded on equal parts."""
+    def _needs(self, patches: Patches, slab: Index, start: float, degree: int) -> Array:
+        """What every patch needs as lam, from Taylor models of some degree."""
         which = terms(self._variables(), degree)
         need, size = np.zeros(len(slab)), max(32, _ENTRIES // (degree + 1) ** which.variables)
         for first in range(0, len(slab), size):
             self.budget.check()
             part = slice(first, first + size)
-            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which, parts)
+            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which)
         return need
 
     def _variables(self) -> int:
         """Of the Taylor models: time, the states and the disturbances."""
         return 1 + self.model.dimension + len(self.model.disturbance)
 
-    def _need(self, patches: Patches, eps: Array, start: float, which: Terms, parts: int) -> Array:
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
         low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
         low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
         need, due = np.zeros(len(eps)), np.flatnonzero(~(low >= 0))
         if len(due):
             low, high = low[due], high[due]
-            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends(parts)[1]
+            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends()[1]
             reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
             found = (excess - eps[due] * reach * (1 - 1e-12)) * (1 + 1e-12)
             need[due] = np.where(np.isfinite(excess), np.maximum(found, 0.0), np.inf)
@@ -355,7 +358,7 @@ class Passage:
 
     def _inputs(self, patches: Patches, which: Terms) -> list[Batch]:
         """Time and states."""
-        return [tm.variable(which, i, patches.low[i], patches.high[i]) for i in range(self.model.dimension + 1)]
+        return [patches.variable(which, i) for i in range(self.model.dimension + 1)]
 
     def _balance(
         self, patches: Patches, inputs: Sequence[Batch], a: list[list[Batch]], share: Array, off: Array

@@ -144,8 +144,8 @@ def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]
     if not found.proposed:
         raise CertificateError(
             "no value function was found that a certificate can state: in one state it states limits that do not move "
-            "and noise that does not jump, in two states bounded boxes that do not move and whose faces paths cross, no "
-            "obstacles and no oblique or curved limits."
+            "and noise that does not jump, in two states bounded boxes that do not move and whose faces paths cross, "
+            "no obstacles and no oblique or curved limits."
         )
     if problem.reach is not None:
         return _entered(problem, *_enough(problem, found.proposed, effort), lower=False)
@@ -186,16 +186,21 @@ def _listed(stages: Surface | tuple[Surface, ...]) -> tuple[Surface, ...]:
 
 def _beyond(problem: Problem, stages: Sequence[Surface]) -> list[Surface]:
     """Surfaces of a lower bound whose sides, and the nodes on faces of constraints, lie a little farther out."""
+    n, marks = problem.system.dimension, list[tuple[int, float, int]]()
+    steps = [INWARD * max(float(np.ptp(surface.axes[axis])) for surface in stages) for axis in range(n)]
+    for constraint in problem.constraints if _windowed(problem) else ():
+        around = constraint.region.hull()
+        for place, *ends in zip(constraint.region.places(n), around.lo.tolist(), around.hi.tolist()):
+            marks += [(place, end, sign) for end, sign in zip(ends, (-1, 1))]
     found = []
     for surface in stages:
-        axes = [_spread(axis) for axis in surface.axes]
-        for constraint in problem.constraints if len(axes) > 1 and _windowed(problem) else ():
-            around = constraint.region.hull()
-            for place, *ends in zip(constraint.region.places(len(axes)), around.lo, around.hi):
-                axis = surface.axes[place]
-                for end, sign in zip(ends, (-1, 1)):
-                    inner = np.abs(axis[1:-1] - end) <= 1e-14 * (1 + abs(end))
-                    axes[place][1:-1] += sign * INWARD * (axis[-1] - axis[0]) * inner
+        axes = []
+        for place, (axis, step) in enumerate(zip(surface.axes, steps)):
+            moved = axis.copy()
+            moved[[0, -1]] += np.array([-step, step])
+            for _, end, sign in (mark for mark in marks if mark[0] == place):
+                moved[1:-1] += sign * step * (np.abs(axis[1:-1] - end) <= 1e-14 * (1 + abs(end)))
+            axes.append(moved)
         found.append(replace(surface, axes=tuple(axes)))
     return found
 
@@ -217,7 +222,9 @@ def _staged(problem: Problem, stages: Sequence[Surface], payment: Payment) -> di
     return shared | {"stages": own}
 
 
-def _entered(problem: Problem, stages: Surface | tuple[Surface, ...], payment: Payment, *, lower: bool) -> dict[str, Any]:
+def _entered(
+    problem: Problem, stages: Surface | tuple[Surface, ...], payment: Payment, *, lower: bool
+) -> dict[str, Any]:
     """A value function of a target. From below the grid keeps off the target, or has small cells around it."""
     assert problem.reach is not None
     (surface,) = (one.raised(payment.lift) for one in _listed(stages))

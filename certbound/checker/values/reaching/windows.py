@@ -4,8 +4,8 @@ In a stage V is what `passage` and `crossing` ask, of the constraints that hold 
 overlap it, from below of those whose windows cover it. At its end a path is at the gate: the set of all constraints
 whose windows hold that instant. V may jump there.
 
-From above, V >= min(V_next, 0) on parts of the grid that lie in the gate and in the next grid, and V >= 0 on all others;
-at the last end nothing is asked of parts in the gate. So exp(theta(V)), stopped at 1, does not rise where V jumps.
+From above, V >= min(V_next, 0) on parts of the grid that lie in the gate and in the next grid, and V >= 0 on all
+others; at the last end nothing is asked of parts in the gate. So exp(theta(V)), stopped at 1, never jumps upward.
 
 From below, V <= V_next on parts in the next grid that were not shown to be off the gate; where these lie outside of the
 next grid, and at the last end, exp(V) <= W. A path on any other part has failed, and V <= 0.
