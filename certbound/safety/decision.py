@@ -334,7 +334,9 @@ class _Search:
 
         Constants that are unknown do not change, and a path may end where it leaves the domain.
         """
-        ends = self.problem.ending and self.problem.system.time == "continuous"
+        system = self.problem.system
+        known = answer.method == "values" and (system.time == "discrete" or system.dimension == 1)
+        ends = self.problem.ending and not known and system.time == "continuous"
         return replace(answer, log10_lower=None, conclusive=False) if ends or self.problem.unknown else answer
 
     @cached_property

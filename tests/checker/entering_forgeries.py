@@ -162,12 +162,12 @@ def _(data: Data) -> None:
     _target(data, high=[0.11])
 
 
-@forges("who leaves by a side may arrive", "arriving below", _FILE, "_ArrivingAbove._missing", LESS)
+@forges("who leaves by a side may arrive", "arriving below", _FILE, "_ArrivingAbove._spared", LESS)
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["high"] = exact([1.1])
 
 
-@forges("who fails counts at most what is taken off", "arriving below", _FILE, "_ArrivingAbove._at_end", LESS)
+@forges("who fails counts at most what is taken off", "arriving below", "values/passage.py", "Passage._at_end", LESS)
 def _(data: Data) -> None:
     """V is lower beside the limit, but at the end."""
     rows = data["proof"]["axes"][0], data["proof"]["times"]

@@ -1,4 +1,4 @@
-"""Forged certificates of constraints that come and go in continuous time: part of ``FORGERIES``."""
+"""Forged certificates of what comes, goes or ends in continuous time: part of ``FORGERIES``."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from tests.checker.forgeries import _BASES, Data, _lower, _sharp, forges, repack
 from tests.checker.value_forgeries import LESS, MORE, _more
 
 _FILE = "values/reaching/windows.py"
+_CROSSING = "values/crossing.py"
 FIRST = 0.2
 
 
@@ -32,17 +33,28 @@ def passing() -> cb.Problem:
     return cb.Problem(system, initial=[0.1], safe=safe, horizon=0.4, delta=0.5)
 
 
+def ending() -> cb.Problem:
+    """One state: before a limit below, or out of its domain above, where paths end."""
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=[[0.6]])
+    start, domain = cb.Box([0.0], [0.1]), cb.Box([-1], [0.5])
+    safe = [cb.Inside(cb.HalfSpace([-1.0], 0.6))]
+    return cb.Problem(system, initial=start, safe=safe, horizon=0.4, domain=domain, leaving="ends", delta=0.5)
+
+
 @cache
-def _found() -> ExitBounds:
+def _found(build: Callable[[], cb.Problem]) -> ExitBounds:
     with patch.object(ladder, "LADDER", ((1.5, 1e-2, 0.1),)):
-        return bound_exits(passing(), seconds=0.1)
+        return bound_exits(build(), seconds=0.1)
 
 
-def _written(*, lower: bool) -> Callable[[], str]:
-    return lambda: answered(passing(), _found(), lower=lower)
+def _written(build: Callable[[], cb.Problem], *, lower: bool) -> Callable[[], str]:
+    return _sharp(lambda: answered(build(), _found(build), lower=lower))
 
 
-_BASES |= {"passing": _sharp(_written(lower=False)), "passing below": _sharp(_written(lower=True))}
+_BASES |= {
+    "passing": _written(passing, lower=False), "passing below": _written(passing, lower=True),
+    "ending": _written(ending, lower=False), "ending below": _written(ending, lower=True),
+}  # fmt: skip
 
 
 def _limit(data: Data, number: int, *, box: float | None = None, during: list[float] | None = None) -> None:
@@ -143,3 +155,26 @@ def _(data: Data) -> None:
 @forges("who passes to where the next stage is silent is taken off", "passing below", _FILE, "_StageBelow.join", LESS)
 def _(data: Data) -> None:
     _elsewhere(data, -20.0)
+
+
+# ---- paths that end as they leave the domain -----------------------------------------------------------------
+
+
+@forges("a path ends by a side beyond the domain only", "ending", "values/passage.py", "Passage._spared", "1, which is")
+def _(data: Data) -> None:
+    data["problem"]["domain"][0][1] = exact(0.501)
+
+
+@forges("the grid lies in the domain, where a path ends", "ending below", _CROSSING, "Crossing._check_domain", "domain")
+def _(data: Data) -> None:
+    data["problem"]["domain"][0][1] = exact(0.499)
+
+
+@forges("stages count the domain as a limit from below", "passing below", "claims.py", "check_side", "as it leaves the")
+def _(data: Data) -> None:
+    data["problem"] |= {"domain": [exact([-2.0, 2.0])], "leaving": "ends"}
+
+
+@forges("a random start counts the domain as a limit", "drifting below", "claims.py", "check_side", "as it leaves the")
+def _(data: Data) -> None:
+    data["problem"] |= {"domain": [exact([-9.0, 9.0])], "leaving": "ends"}

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from flint import arb
@@ -42,6 +43,8 @@ class Crossing(Passage):
 
     def lower(self) -> arb:
         """At most the probability of leaving from one of the stated starts, or from a random one."""
+        if self.model.ends:
+            self._check_domain()
         self.lowered(self._highest())
         return self.crossed([self])
 
@@ -86,14 +89,15 @@ class Crossing(Passage):
 
     def _harmless_sides(self) -> list[tuple[int, int]]:
         """(state, end) of the sides of the grid that were not shown to break a constraint everywhere."""
-        safe, axes = SafeSet(self.model, bounded=False), self.surface.axes
-        sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in axes]
-        found = []
-        for number, end in itertools.product(range(len(axes)), (0, 1)):
-            face = [(side[end], side[end]) if k == number else side for k, side in enumerate(sides)]
-            if not safe.excludes([(a + b) / 2 for a, b in face], [(b - a) / 2 for a, b in face]):
-                found.append((number, end))
-        return found
+        broken = self.excluded(self.limits())
+        return [side for side in itertools.product(range(self.model.dimension), (0, 1)) if side not in broken]
+
+    def _check_domain(self) -> None:
+        """Where a path ends as it leaves the domain, the grid lies in it."""
+        ends = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
+        domain = SafeSet(replace(self.model, constraints=self.model.constraints[-1:]), bounded=False)
+        if not domain.holds([(a + b) / 2 for a, b in ends], [(b - a) / 2 for a, b in ends]):
+            raise Unproved("the grid was not shown to lie in the domain, where a path ends as it leaves that")
 
     def _certain(self, end: float, far: float) -> bool:
         """Whether all starts between a side of the grid and far beyond it break a constraint."""

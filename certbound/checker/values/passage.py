@@ -24,7 +24,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -195,7 +195,7 @@ class Passage:
         """The box of the grid lies in the safe set, and the starts in it."""
         sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
         centre, radius = [(a + b) / 2 for a, b in sides], [(b - a) / 2 for a, b in sides]
-        if not SafeSet(self.model, bounded=False).holds(centre, radius):
+        if not self.limits().holds(centre, radius):
             raise Unproved("the grid was not shown to lie in the safe set")
         initial = self.model.initial
         if self._first() == 0 and not self.random and not all(
@@ -203,10 +203,32 @@ class Passage:
         ):
             raise Unproved("the initial set was not shown to lie in the grid")
 
+    def limits(self) -> SafeSet:
+        """The constraints that a path may break: without the domain where a path ends as it leaves that."""
+        model = self.model
+        return SafeSet(replace(model, constraints=model.constraints[:-1]) if model.ends else model, bounded=False)
+
+    def _spared(self) -> list[tuple[int, int]]:
+        """(state, end) of the sides by which a path ends that does not fail: where it has left the domain before."""
+        if not self.model.ends:
+            return []
+        return self.excluded(SafeSet(replace(self.model, constraints=self.model.constraints[-1:]), bounded=False))
+
+    def excluded(self, region: SafeSet) -> list[tuple[int, int]]:
+        """(state, end) of the sides of the grid that lie outside of a region."""
+        sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
+        found = []
+        for number, end in itertools.product(range(len(sides)), (0, 1)):
+            face = [(side[end], side[end]) if k == number else side for k, side in enumerate(sides)]
+            if region.excludes([(a + b) / 2 for a, b in face], [(b - a) / 2 for a, b in face]):
+                found.append((number, end))
+        return found
+
     def _missing(self) -> float:
-        """What V lacks of 0 on the sides of the box: V plus that has the same residual."""
-        sides = itertools.product(range(self.model.dimension), (0, 1))
-        return -min(0.0, *(float(self.across(axis, -side)[0].min()) for axis, side in sides))
+        """What V lacks of 0 on the sides by which paths fail: V plus that has the same residual."""
+        spared = self._spared()
+        sides = [side for side in itertools.product(range(self.model.dimension), (0, 1)) if side not in spared]
+        return -min([0.0, *(float(self.across(axis, -end)[0].min()) for axis, end in sides)])
 
     def across(self, axis: int, node: int) -> tuple[Array, Array]:
         """Ends of V, before it is lifted, where a state is at a node: over all patches, time slowest."""
@@ -281,11 +303,12 @@ class Passage:
         return total
 
     def _at_end(self) -> float:
-        """At most V at the horizon."""
+        """At most V at the horizon, and where paths end that do not fail."""
         n = self.model.dimension
         patches = self.surface.frozen(-1).patches(0, 1)
         low = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
-        return float(np.nextafter(low.min() + self.lift, -np.inf))
+        least = min([low.min(), *(self.across(axis, -end)[0].min() for axis, end in self._spared())])
+        return float(np.nextafter(least + self.lift, -np.inf))
 
     def _part(self, patches: Patches, i: int, low: Array, high: Array, which: Terms) -> Batch:
         """xi of a state on the part of every patch between ``low`` and ``high``."""

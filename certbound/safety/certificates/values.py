@@ -72,8 +72,6 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
         raise CertificateError("no lower bound was found.")
     if isinstance(answer.details, FailureBounds):
         return induction_proof(problem, answer, attempt, lower=True)
-    if problem.ending:
-        raise CertificateError("certificates of lower bounds count leaving the domain as failing in continuous time.")
     if isinstance(answer.details, Lasting):
         return _lasting(problem, attempt, above=False)
     if isinstance(answer.details, Rate) and answer.details.fast is not None:
@@ -152,7 +150,8 @@ def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]
     best = min(payment.log for _, payment in found.proposed)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
     stages, payment = next(pair for pair in found.proposed if pair[1].log <= best + share)
-    return _staged(problem, [surface.raised(payment.lift) for surface in _listed(stages)], payment)
+    raised = [surface.raised(payment.lift) for surface in _listed(stages)]
+    return _staged(problem, [_past_domain(problem, surface) for surface in raised], payment)
 
 
 def _crossing(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]:
@@ -184,6 +183,17 @@ def _listed(stages: Surface | tuple[Surface, ...]) -> tuple[Surface, ...]:
     return (stages,) if isinstance(stages, Surface) else stages
 
 
+def _past_domain(problem: Problem, surface: Surface) -> Surface:
+    """With sides at which paths end, as they leave the domain, a little beyond it."""
+    if not problem.ending or problem.domain is None:
+        return surface
+    axes = [axis.copy() for axis in surface.axes]
+    for axis, low, high in zip(axes, problem.domain.low, problem.domain.high):
+        step = INWARD * (axis[-1] - axis[0])
+        axis[[0, -1]] += np.array([-step, step]) * (axis[[0, -1]] == np.array([low, high]))
+    return replace(surface, axes=tuple(axes))
+
+
 def _beyond(problem: Problem, stages: Sequence[Surface]) -> list[Surface]:
     """Surfaces of a lower bound whose sides, and the nodes on faces of constraints, lie a little farther out."""
     n, marks = problem.system.dimension, list[tuple[int, float, int]]()
@@ -197,7 +207,8 @@ def _beyond(problem: Problem, stages: Sequence[Surface]) -> list[Surface]:
         axes = []
         for place, (axis, step) in enumerate(zip(surface.axes, steps)):
             moved = axis.copy()
-            moved[[0, -1]] += np.array([-step, step])
+            ends = [problem.domain.low[place], problem.domain.high[place]] if problem.ending and problem.domain else []
+            moved[[0, -1]] += np.array([-step, step]) * ([end not in ends for end in axis[[0, -1]]])
             for _, end, sign in (mark for mark in marks if mark[0] == place):
                 moved[1:-1] += sign * step * (np.abs(axis[1:-1] - end) <= 1e-14 * (1 + abs(end)))
             axes.append(moved)
