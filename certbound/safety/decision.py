@@ -330,13 +330,9 @@ class _Search:
         return prove_truncated(row.prove, self.problem, request)
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
-        """The answer without its lower bound where that is of disturbances that may change, or counts too much.
-
-        Constants that are unknown do not change, and a path may end where it leaves the domain.
-        """
-        system = self.problem.system
-        known = answer.method == "values" and (system.time == "discrete" or system.dimension == 1)
-        ends = self.problem.ending and not known and system.time == "continuous"
+        """The answer without its lower bound where constants are unknown, or where it counts paths that only ended."""
+        system, ends = self.problem.system, self.problem.ending
+        ends = ends and system.time == "continuous" and (system.dimension > 1 or answer.method != "values")
         return replace(answer, log10_lower=None, conclusive=False) if ends or self.problem.unknown else answer
 
     @cached_property

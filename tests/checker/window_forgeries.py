@@ -18,7 +18,7 @@ from tests.checker.entering_forgeries import answered
 from tests.checker.forgeries import _BASES, Data, _lower, _sharp, forges, repacked
 from tests.checker.value_forgeries import LESS, MORE, _more
 
-_FILE = "values/reaching/windows.py"
+_FILE = "values/reaching/gated.py"
 _CROSSING = "values/crossing.py"
 FIRST = 0.2
 

@@ -1,4 +1,4 @@
-"""The function V that a certificate states in continuous time, patch by patch, as Taylor models of it and its slopes.
+"""What a certificate states in continuous time: V, patch by patch, as Taylor models of it and its slopes; and levels.
 
 V takes stated values and derivatives (up to the second in every state) at the nodes of a grid, and stated rates, at the
 ends of slabs of time: degree 5 in every state and 3 in time on every patch. The data are shared by neighbours, so that
@@ -16,10 +16,14 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
+from flint import arb
 
+from certbound.checker.report import Unproved
 from certbound.checker.values.batches import Array, Batch, Index, Terms, variable
+from certbound.errors import CertificateError
 
 _ROUNDING = 400 * 2.0**-53
 _UP = 1 + 2.0**-40
@@ -165,6 +169,50 @@ class Patches:
             for k in (1, 2, 4, 5):
                 data[(slice(None),) * axis + (k,)] *= half[axis] if k % 3 == 1 else half[axis] * half[axis]
         return data, np.abs(data)
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """m between ``edges`` (rising, the last one 0) and q at them, for a bound from above or from below."""
+
+    edges: list[float]
+    m: list[float]
+    q: list[float]
+    upper: bool = True
+
+    def __post_init__(self) -> None:
+        edges, m, q, sign = self.edges, self.m, self.q, -1 if self.upper else 1
+        if not (len(edges) == len(q) == len(m) + 1 and edges[-1] == 0 and all(a < b for a, b in pairwise(edges))):
+            raise CertificateError("`proof.edges` must rise to 0, with one m less and as many q.")
+        if not all(rate >= 0 for rate in m) or q[0] != 0 or not all(value >= 0 for value in q):
+            raise CertificateError("`proof.m` must not be negative, and `proof.q` must rise from 0.")
+        if self.upper and not all(value < 1 for value in q):
+            raise CertificateError("`proof.q` must stay below 1.")
+        for (a, b), (left, right), rate in zip(pairwise(edges), pairwise(q), m):
+            slope = (arb(right) - left) / (arb(b) - a)
+            # convex in q, or (from below) concave
+            due = [(1 + sign * arb(end)) * (rate - arb(end)) for end in (left, right)]
+            top = (arb(rate) - 1) / 2
+            if not self.upper and not (top <= min(left, right) or top >= max(left, right)):
+                due.append((1 + arb(rate)) ** 2 / 4)
+            if not all(slope >= least for least in due):
+                raise Unproved("q was not shown to grow as fast as its inequality asks")
+
+    def least(self, low: Array, high: Array) -> Array:
+        """The least m of the levels in [low, min(high, 0)]."""
+        found = np.full(low.shape, np.inf)
+        for (a, b), rate in zip(pairwise(self.edges), self.m):
+            found = np.where((low <= b) & (high >= a), np.minimum(found, rate), found)
+        return np.where((low > self.edges[0]) & np.isfinite(found), found, 0.0)
+
+    def above(self, level: arb) -> arb:
+        """At least the integral of q from a level to 0."""
+        total = arb(0)
+        for (a, b), (left, right) in zip(pairwise(self.edges), pairwise(self.q)):
+            start = arb.max(arb.min(level, arb(b)), arb(a))
+            share = (arb(b) - start) / (arb(b) - a)
+            total += (arb(right) - (arb(right) - left) * share / 2) * (arb(b) - start)
+        return total
 
 
 def _derived(basis: Array, order: int) -> Array:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,7 +37,7 @@ from certbound.checker.statement import Model, SafeSet
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.batches import Array, Batch, Index, Mask, Terms, above, below, terms
-from certbound.checker.values.hermite import Patches, Surface
+from certbound.checker.values.hermite import Levels, Patches, Surface
 from certbound.checker.values.step_back import independent
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
@@ -54,50 +54,6 @@ _CUT = {1: ((8, 2),), 2: ((8, 2), (12, 2))}
 _LEAST = 2.0**-20  # V is at least so far below 0 where paths end that have not left, so that exp(V) is not 1
 _ENTRIES = 4_000_000
 _CHUNK = 4096
-
-
-@dataclass(frozen=True, eq=False)
-class Levels:
-    """m between ``edges`` (rising, the last one 0) and q at them, for a bound from above or from below."""
-
-    edges: list[float]
-    m: list[float]
-    q: list[float]
-    upper: bool = True
-
-    def __post_init__(self) -> None:
-        edges, m, q, sign = self.edges, self.m, self.q, -1 if self.upper else 1
-        if not (len(edges) == len(q) == len(m) + 1 and edges[-1] == 0 and all(a < b for a, b in pairwise(edges))):
-            raise CertificateError("`proof.edges` must rise to 0, with one m less and as many q.")
-        if not all(rate >= 0 for rate in m) or q[0] != 0 or not all(value >= 0 for value in q):
-            raise CertificateError("`proof.m` must not be negative, and `proof.q` must rise from 0.")
-        if self.upper and not all(value < 1 for value in q):
-            raise CertificateError("`proof.q` must stay below 1.")
-        for (a, b), (left, right), rate in zip(pairwise(edges), pairwise(q), m):
-            slope = (arb(right) - left) / (arb(b) - a)
-            # convex in q, or (from below) concave
-            due = [(1 + sign * arb(end)) * (rate - arb(end)) for end in (left, right)]
-            top = (arb(rate) - 1) / 2
-            if not self.upper and not (top <= min(left, right) or top >= max(left, right)):
-                due.append((1 + arb(rate)) ** 2 / 4)
-            if not all(slope >= least for least in due):
-                raise Unproved("q was not shown to grow as fast as its inequality asks")
-
-    def least(self, low: Array, high: Array) -> Array:
-        """The least m of the levels in [low, min(high, 0)]."""
-        found = np.full(low.shape, np.inf)
-        for (a, b), rate in zip(pairwise(self.edges), self.m):
-            found = np.where((low <= b) & (high >= a), np.minimum(found, rate), found)
-        return np.where((low > self.edges[0]) & np.isfinite(found), found, 0.0)
-
-    def above(self, level: arb) -> arb:
-        """At least the integral of q from a level to 0."""
-        total = arb(0)
-        for (a, b), (left, right) in zip(pairwise(self.edges), pairwise(self.q)):
-            start = arb.max(arb.min(level, arb(b)), arb(a))
-            share = (arb(b) - start) / (arb(b) - a)
-            total += (arb(right) - (arb(right) - left) * share / 2) * (arb(b) - start)
-        return total
 
 
 class Passage:

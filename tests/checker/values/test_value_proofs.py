@@ -26,9 +26,9 @@ from certbound.checker.values import batches as tm
 from certbound.checker.values import check_values_below, quadratic, walls
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.crossing import has_full_rank
-from certbound.checker.values.hermite import Surface
+from certbound.checker.values.hermite import Levels, Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
-from certbound.checker.values.passage import Levels, Passage
+from certbound.checker.values.passage import Passage
 from certbound.checker.values.quadratic import missing_form, splitting
 from certbound.checker.values.second_order import Flow
 from certbound.checker.values.step_back import Grid, Steps, Values
