@@ -121,7 +121,7 @@ def test_value_functions_count_it_in_continuous_time_and_other_engines_say_nothi
         system, initial=[0.0], safe=[cb.Inside(cb.HalfSpace([1], 1))], horizon=1, domain=cb.Box([-0.5], [2]),
         leaving="ends", delta=1e-3,
     )  # fmt: skip
-    with patch.object(ladder, "LADDER", ((2.0, 5e-3, 0.1),)):
+    with patch.object(ladder, "LADDER", ((1.5, 1e-2, 0.1), (2.5, 1e-3, 0.03))):
         verdict = cb.verify_safety(problem, method="values", time_limit=5)
     assert verdict.status == "UNSAFE"
     assert -3 < verdict.log10_lower < verdict.log10_delta
