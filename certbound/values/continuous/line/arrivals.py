@@ -74,8 +74,8 @@ def bound_ended(problem: Problem, model: Model, seconds: float) -> Bounds | None
     """The same as `bound_line` of P(failing) where a path ends as it leaves the domain; None where that says nothing.
 
     Where both limits lie within the domain, it does not matter; where one does, failing is to arrive there before the
-    domain's other end, where e^V <= w (above: >= w) has to hold. None for limits that move or have windows, and random
-    starts: there leaving the domain counts as failing.
+    domain's other end, where e^V <= w (above: >= w) has to hold. None for limits that move or have windows, random
+    starts, and noise that vanishes between: there leaving the domain counts as failing.
     """
     domain, start = problem.domain, start_of(problem)
     plain = problem.replace(domain=None, leaving="unsafe")
@@ -99,8 +99,13 @@ def bound_ended(problem: Problem, model: Model, seconds: float) -> Bounds | None
     pairs = [(ends[0], room.phases[0].high) if side == 1 else (room.phases[0].low, ends[1]) for room in (inner, outer)]
     early, late = (_between(room, pair, side, model, start) for room, pair in zip((inner, outer), pairs))
     wide = late.phases[0]
-    check_noise(late.models[0], (wide.start, wide.end), [(wide.low, wide.high)])
+    try:
+        check_noise(late.models[0], (wide.start, wide.end), [(wide.low, wide.high)])
+    except InfeasibleError:
+        return None
     least, most, done, (below, above) = _bounds(early, late, (start, start), side, lowered=True)
+    if not most < 0 and least == -math.inf:
+        return None
     words = f"value function in one state for failing before the domain is left, cells x slabs of time: {_listed(done)}"
     return most, None if least == -math.inf else least, words, (_each(above), _each(below))
 
