@@ -204,12 +204,18 @@ def _cells(
         yield replace(model, disturbance=values, drawn=()), record["proof"], record.at("proof"), weight
 
 
+def _knows_ends(model: Model, proof: object) -> bool:
+    """Whether a proof by value functions lets a path end where it leaves the domain, from below too."""
+    staged = isinstance(proof, Mapping) and "stages" in proof
+    return not model.continuous or (model.target is None and model.initial.covariance is None and not staged)
+
+
 def check_side(model: Model, proof: object, lower: bool) -> None:
     """Lower bounds are proved of one start and without a target, and say so in ``side``; others must not.
 
     CertificateError where a proof says one thing and the claim another.
     """
-    if lower and model.ends and (model.continuous or not _is(proof, "values")):  # others count the domain as a limit
+    if lower and model.ends and not (_is(proof, "values") and _knows_ends(model, proof)):  # the domain is a limit there
         raise CertificateError("`claim.log10_lower` must not be there where a path ends as it leaves the domain.")
     if lower and model.unknown:
         raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")

@@ -329,11 +329,9 @@ class _Search:
         return prove_truncated(row.prove, self.problem, request)
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
-        """The answer without its lower bound where that is of disturbances that may change, or counts too much.
-
-        Constants that are unknown do not change, and a path may end where it leaves the domain.
-        """
-        ends = self.problem.ending and self.problem.system.time == "continuous"
+        """The answer without its lower bound where constants are unknown, or where it counts paths that only ended."""
+        system, ends = self.problem.system, self.problem.ending
+        ends = ends and system.time == "continuous" and (system.dimension > 1 or answer.method != "values")
         return replace(answer, log10_lower=None, conclusive=False) if ends or self.problem.unknown else answer
 
     @cached_property

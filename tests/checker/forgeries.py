@@ -1050,12 +1050,12 @@ def _(data: Data) -> None:
     _lower(data, 0.005)
 
 
-@forges("q grows as its inequality asks", "leaving", "values/passage.py", "Levels", "q was not shown")
+@forges("q grows as its inequality asks", "leaving", "values/hermite.py", "Levels", "q was not shown")
 def _(data: Data) -> None:
     data["proof"] |= {"edges": exact([-8.0, 0.0]), "m": exact([0.5]), "q": exact([0.0, 0.0])}
 
 
-@forges("q lies between 0 and 1", "leaving", "values/passage.py", "Levels", "stay below 1")
+@forges("q lies between 0 and 1", "leaving", "values/hermite.py", "Levels", "stay below 1")
 def _(data: Data) -> None:
     data["proof"] |= {"edges": exact([-8.0, 0.0]), "m": exact([0.5]), "q": exact([0.0, 1.0])}
 

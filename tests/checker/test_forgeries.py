@@ -17,6 +17,7 @@ from tests.checker import (  # noqa: F401  # they enter themselves
     lasting_forgeries,
     turned_forgeries,
     value_forgeries,
+    window_forgeries,
 )
 from tests.checker.forgeries import FORGERIES, forged, text
 

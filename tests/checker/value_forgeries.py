@@ -244,12 +244,12 @@ def _(data: Data) -> None:
     jumping(data, "sign", 1, 0.6)
 
 
-@forges("q grows from below as its inequality asks", "leaving below", _ABOVE, "Levels", "q was not shown")
+@forges("q grows from below as its inequality asks", "leaving below", "values/hermite.py", "Levels", "q was not shown")
 def _(data: Data) -> None:
     data["proof"] |= {"edges": exact([-8.0, 0.0]), "m": exact([0.5]), "q": exact([0.0, 0.0])}
 
 
-@forges("q grows from below where it matters most", "leaving below", _ABOVE, "Levels", "q was not shown")
+@forges("q grows from below where it matters most", "leaving below", "values/hermite.py", "Levels", "q was not shown")
 def _(data: Data) -> None:  # (1 + q)(3 - q) is 3 at both ends, and 4 in between
     data["proof"] |= {"edges": exact([-0.6, 0.0]), "m": exact([3.0]), "q": exact([0.0, 2.0])}
 

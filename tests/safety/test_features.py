@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from certbound.problem.model import compile_numpy
 from certbound.safety.answers import exact
 from certbound.safety.certificate import problem_data
 from certbound.simulation.estimates.statistics import bound_binomial
+from certbound.values.continuous.line import ladder
+from tests.checker.conftest import side_of
 
 PATHS = 4000
 STEPS = 200
@@ -53,6 +56,9 @@ def _with(text: str, *pairs: tuple[str, str]) -> str:
     return text
 
 
+LOOSE = FLOW.replace("delta = 0.3", "delta = 0.9")
+INSIDE = "box = { x = [-1, 1] }"
+ENDS = (INSIDE, "box = { x = [-0.6, 3] }"), ("[init", "[domain]\nbox = { x = [-2, 0.9] }\nleaving = 'ends'\n[init")
 QUICK = ("union", "target", "polygon", "packets", "forever", "growth", "staying", "ruin", "sampled")
 LAW = 'law = "gaussian"\nstd = 0.3'
 ROWS: dict[str, str] = {name: STARTERS[name] for name in QUICK} | {
@@ -71,11 +77,18 @@ ROWS: dict[str, str] = {name: STARTERS[name] for name in QUICK} | {
     "uniform": _with(PLAIN, (LAW, 'law = "uniform"\nhalfwidth = 0.5')),
     "sign and floor": _with(PLAIN, ("0.8*x", "0.8*x - 0.1*sign(x) + 0.05*floor(2*x)"), ("0.3\n[in", "0.2\n[in")),
     "a long horizon": _with(PLAIN, ("horizon = 6", "horizon = 2500"), ("std = 0.3", "std = 0.14")),
+    "windows in continuous time": LOOSE + "[[stay]]\nbox = { x = [-0.6, 0.7] }\nduring = [0.6, 1]\n",
+    "target in continuous time": LOOSE + "[[reach]]\nbox = { x = [-0.3, 0.1] }\n",
+    "triangular": _with(PLAIN, (LAW, 'law = "triangular"\nhalfwidth = 0.6')),
+    "ends": _with(PLAIN, *ENDS),
+    "ends in continuous time": _with(FLOW, *ENDS),
     "a target for ever": _with(FLOW, ("horizon = 1", "horizon = inf")) + "[[reach]]\nbox = { x = [-0.3, 0] }\n",
 }  # fmt: skip
 
 SLOW = ("a long horizon", "a model that jumps in time", "sampled")
-METHODS = {"a target for ever": "values", "ruin": "values", "union": "linear"}
+METHODS = {name: "values" for name in ROWS if name.endswith(("continuous time", "for ever"))}
+BELOW = ("ends", "triangular")
+METHODS |= {"ruin": "values", "union": "linear"}
 OWN = {"discrete": "values", "continuous": "linear"}
 
 
@@ -200,7 +213,8 @@ def test_a_feature_is_saved_bounded_simulated_and_certified(name: str, tmp_path:
     data = problem_data(problem)
     assert problem_data(cb.load(tmp_path / "again.toml")) == data
     hold_moments(problem, np.random.default_rng(11))
-    verdict = cb.verify_safety(problem, method=METHODS.get(name, OWN[problem.system.time]))
+    with patch.object(ladder, "LADDER", ((1.5, 1e-2, 0.1),)):
+        verdict = cb.verify_safety(problem, method=METHODS.get(name, OWN[problem.system.time]))
     assert verdict.status == "SAFE"
     rng, first = np.random.default_rng(7), problem.starts[0]
     point = len(problem.starts) == 1 and (first.random or np.ptp([first.hull().lo, first.hull().hi]) == 0)
@@ -214,3 +228,8 @@ def test_a_feature_is_saved_bounded_simulated_and_certified(name: str, tmp_path:
     assert claim < 0
     twin["claim"]["log10_delta"] = exact(1.001 * claim - 1e-3)
     assert not check_data(twin, data, allow_assumptions=True).valid
+    if name in BELOW:
+        twin = json.loads(side_of(problem, dict(verdict.answers), lower=True))
+        assert check_data(twin, data).valid
+        twin["claim"]["log10_lower"] = exact(0.99 * verdict.log10_delta)
+        assert not check_data(twin, data).valid

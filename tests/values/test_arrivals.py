@@ -1,9 +1,13 @@
 """Targets in continuous time, one state: both bounds against closed forms and simulation, and what is refused."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.values.continuous import bound_exits, straight
+from certbound.values.continuous.line import ladder
 from certbound.values.continuous.line.arrivals import complement
 
 
@@ -89,3 +93,27 @@ def test_what_is_not_served_says_so(changes, message):
     answer = values_engine(flow().replace(**changes))
     assert not answer.applicable
     assert message in answer.reason
+
+
+@pytest.mark.parametrize("end", [0.5, 3.0])
+def test_a_path_that_leaves_its_domain_does_not_fail(end: float) -> None:
+    """Brownian motion: failing below, before ending above; by both limits where the domain ends beyond them."""
+    system = cb.ContinuousSystem(lambda x: 0 * x, states=1, diffusion=1.0)
+    problem = cb.Problem(
+        system, initial=[0.1], safe=[cb.Inside(cb.Box([-0.5], [2.0]))], horizon=4.0, domain=cb.Box([-4], [end]),
+        leaving="ends",
+    )  # fmt: skip
+    with patch.object(ladder, "LADDER", ((2.0, 5e-3, 0.1),)):
+        found = bound_exits(problem, seconds=0.1)
+    truth = hitting(-0.1, -0.5, 0.5, 4.0) if end < 2 else hitting(0.1, -0.5, 2.0, 4.0) + hitting(-0.1, -2.0, 0.5, 4.0)
+    assert found.lower is not None
+    assert 0.8 * truth <= 10**found.lower <= truth <= 10**found.upper <= 1.2 * truth
+
+
+def test_where_the_domain_counts_as_a_limit_there_is_no_lower_bound() -> None:
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.5 * np.eye(2))
+    safe, domain = [cb.Inside(cb.Box([-1, -1], [1, 1]))], cb.Box([-2, -2], [0.9, 2])
+    problem = cb.Problem(system, initial=[0, 0], safe=safe, horizon=1.0, domain=domain, leaving="ends")
+    with patch.object(straight, "bound_plane", lambda *_: (-1.0, -2.0, "", ((), ()))):
+        assert bound_exits(problem).lower is None
+        assert bound_exits(problem.replace(leaving="unsafe")).lower is not None

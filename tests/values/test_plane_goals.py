@@ -132,7 +132,7 @@ def test_bounds_over_windows_hold_what_a_simulation_finds(chains):
     (above, upper), (below, lower) = chains
     assert [stage.high for stage in above.stages] == [(1.0, 1.0), (0.6, 0.6)]
     assert above.stages[0].gate_high == (0.6, 0.6)
-    assert NARROW[0] <= windows.prove_chain_above(upper, above).log <= 0
+    assert NARROW[0] <= windows.prove_chain_above(upper, above)[1].log <= 0
     least = windows.prove_chain_below(lower, below)
     assert least is None or least.log <= NARROW[1]
 
@@ -142,7 +142,7 @@ def test_no_surface_of_a_stage_makes_a_bound_that_is_wrong(chains, which, shift)
     for chain, surfaces in chains:
         moved = [one.raised(shift) if k == which else one for k, one in enumerate(surfaces)]
         if chain.upper:
-            assert windows.prove_chain_above(moved, chain).log >= NARROW[0]
+            assert windows.prove_chain_above(moved, chain)[1].log >= NARROW[0]
         else:
             least = windows.prove_chain_below(moved, chain)
             assert least is None or least.log <= NARROW[1]

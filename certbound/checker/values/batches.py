@@ -98,20 +98,17 @@ class Batch:
         slack = (np.abs(self.value) + reach) * 2 * _UNIT
         return self.value - reach - slack, self.value + reach + slack
 
-    def sharp_ends(self, parts: int = 1) -> tuple[Array, Array]:
-        """Bounds of all values from the Bernstein coefficients, between which a polynomial lies, on equal parts."""
+    def sharp_ends(self) -> tuple[Array, Array]:
+        """Bounds of all values from the Bernstein coefficients, between which a polynomial lies."""
         which, count = self.terms, self.terms.degree + 1
         table = np.zeros((count,) * which.variables + self.error.shape)
         for exponents, row in zip(which.exponents, self.coefficients):
             table[exponents] = row
-        least, most = np.full((2, len(self.error)), [[np.inf], [-np.inf]])
-        for place in itertools.product(range(parts), repeat=which.variables):
-            part = table
-            for axis, number in enumerate(place):
-                matrix = _to_bernstein(count - 1, number, parts)
-                part = np.moveaxis(np.tensordot(matrix, part, axes=([1], [axis])), 0, axis)
-            least = np.minimum(least, part.reshape(-1, len(self.error)).min(axis=0))  # what is no number stays none
-            most = np.maximum(most, part.reshape(-1, len(self.error)).max(axis=0))
+        matrix = _to_bernstein(count - 1)
+        for axis in range(which.variables):
+            table = np.moveaxis(np.tensordot(matrix, table, axes=([1], [axis])), 0, axis)
+        rows = table.reshape(-1, len(self.error))
+        least, most = rows.min(axis=0), rows.max(axis=0)  # what is no number stays none
         size = np.abs(self.coefficients).sum(axis=0)  # the matrices' entries are at most 1
         slack = (self.error + which.variables * (count + 4) * _UNIT * size + _TINY) * _UP
         low, high = self.ends()
@@ -123,17 +120,13 @@ class Batch:
 
 
 @lru_cache(maxsize=32)
-def _to_bernstein(degree: int, number: int, parts: int) -> Array:
-    """From powers of xi in [-1, 1] to Bernstein coefficients on one of equal parts, entries rounded once.
-
-    xi^k = (w s + a)^k with w = 2 / parts, a the part's lower end.
-    """
-    width, end = Fraction(2, parts), Fraction(2 * number, parts) - 1
+def _to_bernstein(degree: int) -> Array:
+    """From powers of xi = 2 s - 1 in [-1, 1] to Bernstein coefficients, entries rounded once."""
     rows = []
     for j in range(degree + 1):
         row = []
         for k in range(degree + 1):
-            found = (math.comb(k, i) * width**i * end ** (k - i) * Fraction(math.comb(j, i), math.comb(degree, i))
+            found = (math.comb(k, i) * 2**i * (-1) ** (k - i) * Fraction(math.comb(j, i), math.comb(degree, i))
                      for i in range(min(j, k) + 1))  # fmt: skip
             row.append(float(sum(found, Fraction(0))))
         rows.append(row)

@@ -22,6 +22,8 @@ to have full rank, so that the equation with it has a (weak) solution.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from flint import arb
@@ -41,26 +43,36 @@ class Crossing(Passage):
 
     def lower(self) -> arb:
         """At most the probability of leaving from one of the stated starts, or from a random one."""
-        highest = self._highest()
+        if self.model.ends:
+            self._check_domain()
+        self.lowered(self._highest())
+        return self.crossed([self])
+
+    def lowered(self, highest: float) -> None:
+        """Take off what V exceeds."""
         self.lift = -float(np.nextafter(highest, np.inf)) if not highest <= 0 else 0.0
+
+    def crossed(self, stages: Sequence[Crossing]) -> arb:
+        """The same over stages that follow each other, this one being the first; all are lowered."""
         start = self._level()
-        lam = self._payments(start)
-        times = [arb(float(t)) for t in self.surface.times]
-        steps = [b - a for a, b in itertools.pairwise(times)]
-        paid = sum((arb(float(rate)) * step for rate, step in zip(lam, steps)), arb(0))
-        rest = sum((arb(float(rate)) * step for rate, step in zip(self.eps, steps)), arb(0))
+        slabs = [paid for stage in stages for paid in stage.paid(start)]
+        lam, rest = (sum(parts, arb(0)) for parts in zip(*slabs))
         most = 1 + arb(max(self.levels.q))
         if self.random:
             growth = self.levels.above(arb(self.levels.edges[0]))
-            found = self._mean(lambda low, _: (arb(low) - growth - most * paid).exp(), self._certain)
+            found = self._mean(lambda low, _: (arb(low) - growth - most * lam).exp(), self._certain)
         else:
-            found = (arb(start) - self.levels.above(arb(start)) - most * paid).exp()
-        ceiling = max([self._at_end(), *(self._on(*side) for side in self._harmless_sides())])
+            found = (arb(start) - self.levels.above(arb(start)) - most * lam).exp()
+        ceiling = max(stage.ceiling() for stage in stages)
         if not ceiling < 0:
             return arb(0)
         kept = arb(ceiling).exp()
         left = found - most * arb(start).exp() * rest
         return arb.max((left - kept) / (1 - kept), arb(0)).lower()
+
+    def ceiling(self) -> float:
+        """At least V where a path ends that has not failed."""
+        return max([self._at_end(), *(self._on(*side) for side in self._harmless_sides())])
 
     def _level(self) -> float:
         """At most V(0, .) at the best of the stated starts; of a random one, about what its mean comes to."""
@@ -77,14 +89,15 @@ class Crossing(Passage):
 
     def _harmless_sides(self) -> list[tuple[int, int]]:
         """(state, end) of the sides of the grid that were not shown to break a constraint everywhere."""
-        safe, axes = SafeSet(self.model, bounded=False), self.surface.axes
-        sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in axes]
-        found = []
-        for number, end in itertools.product(range(len(axes)), (0, 1)):
-            face = [(side[end], side[end]) if k == number else side for k, side in enumerate(sides)]
-            if not safe.excludes([(a + b) / 2 for a, b in face], [(b - a) / 2 for a, b in face]):
-                found.append((number, end))
-        return found
+        broken = self.excluded(self.limits())
+        return [side for side in itertools.product(range(self.model.dimension), (0, 1)) if side not in broken]
+
+    def _check_domain(self) -> None:
+        """Where a path ends as it leaves the domain, the grid lies in it."""
+        ends = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
+        domain = SafeSet(replace(self.model, constraints=self.model.constraints[-1:]), bounded=False)
+        if not domain.holds([(a + b) / 2 for a, b in ends], [(b - a) / 2 for a, b in ends]):
+            raise Unproved("the grid was not shown to lie in the domain, where a path ends as it leaves that")
 
     def _certain(self, end: float, far: float) -> bool:
         """Whether all starts between a side of the grid and far beyond it break a constraint."""
@@ -120,7 +133,7 @@ class Crossing(Passage):
         """The disturbance takes fixed values."""
         return 1 + self.model.dimension
 
-    def _need(self, patches: Patches, eps: Array, start: float, which: Terms, parts: int) -> Array:
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
         low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
         low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
         m = self.levels.least(low, high)
@@ -130,7 +143,7 @@ class Crossing(Passage):
         best = np.full(len(eps), -np.inf)
         for corner in corners:
             pushed = [tm.fixed(which, np.full(len(eps), value)) for value in corner]
-            found = self._balance(patches, inputs + pushed, squares, 1 + m, (1 + m) * 2.0**-52).sharp_ends(parts)[0]
+            found = self._balance(patches, inputs + pushed, squares, 1 + m, (1 + m) * 2.0**-52).sharp_ends()[0]
             best = np.where(np.isfinite(found), np.maximum(best, found), best)
         if len(corners) > 1:
             best = np.where(has_full_rank(squares), best, -np.inf)

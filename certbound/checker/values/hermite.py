@@ -1,4 +1,4 @@
-"""The function V that a certificate states in continuous time, patch by patch, as Taylor models of it and its slopes.
+"""What a certificate states in continuous time: V, patch by patch, as Taylor models of it and its slopes; and levels.
 
 V takes stated values and derivatives (up to the second in every state) at the nodes of a grid, and stated rates, at the
 ends of slabs of time: degree 5 in every state and 3 in time on every patch. The data are shared by neighbours, so that
@@ -13,11 +13,17 @@ absolute terms (a patch has at most 144 data, and each a dozen operations).
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
+from flint import arb
 
-from certbound.checker.values.batches import Array, Batch, Index, Terms
+from certbound.checker.report import Unproved
+from certbound.checker.values.batches import Array, Batch, Index, Terms, variable
+from certbound.errors import CertificateError
 
 _ROUNDING = 400 * 2.0**-53
 _UP = 1 + 2.0**-40
@@ -90,15 +96,36 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """P patches: ``low`` and ``high`` of shape (1 + n, P), time first, and the data, shape (4, 6[, 6], P)."""
+    """P patches: ``low`` and ``high`` of shape (1 + n, P), time first, and the data, shape (4, 6[, 6], P).
+
+    Models of V are of one of ``parts`` equal parts of every patch along every axis, by its numbers.
+    """
 
     low: Array
     high: Array
     data: Array
+    parts: int = 1
+    numbers: tuple[int, ...] = ()
 
     def take(self, places: Index | slice) -> Patches:
         """Some of the patches."""
-        return Patches(self.low[:, places], self.high[:, places], self.data[..., places])
+        return Patches(self.low[:, places], self.high[:, places], self.data[..., places], self.parts, self.numbers)
+
+    def cut(self, parts: int) -> Iterator[Patches]:
+        """All equal parts, ``parts`` (a power of 2) along every axis."""
+        for numbers in itertools.product(range(parts), repeat=len(self.low)):
+            yield replace(self, parts=parts, numbers=numbers)
+
+    def variable(self, which: Terms, axis: int) -> Batch:
+        """Time or a state."""
+        found = variable(which, axis, self.low[axis], self.high[axis])
+        if self.parts == 1:
+            return found
+        middle, half = found.value, found.coefficients[1 + axis]
+        offset = half * ((2 * self.numbers[axis] + 1) / self.parts - 1)
+        found.coefficients[0] = middle + offset
+        found.coefficients[1 + axis] = half / self.parts
+        return Batch(which, found.coefficients, found.error + (np.abs(middle) + np.abs(half)) * 2.0**-51)
 
     def derivative(self, which: Terms, orders: tuple[int, ...]) -> Batch:
         """d^orders V, time first, as Taylor models; terms beyond the degree lie in the error."""
@@ -106,6 +133,8 @@ class Patches:
         total, size = self._scaled(half)
         for axis, order in enumerate(orders):
             basis = _derived(IN_TIME if axis == 0 else IN_SPACE, order)
+            if self.parts > 1:
+                basis = _restricted(basis, self.parts, self.numbers[axis])
             total, size = _along(basis, total, axis), _along(np.abs(basis), size, axis)
         factor = np.ones(half.shape[1])
         for axis, order in enumerate(orders):
@@ -142,11 +171,63 @@ class Patches:
         return data, np.abs(data)
 
 
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """m between ``edges`` (rising, the last one 0) and q at them, for a bound from above or from below."""
+
+    edges: list[float]
+    m: list[float]
+    q: list[float]
+    upper: bool = True
+
+    def __post_init__(self) -> None:
+        edges, m, q, sign = self.edges, self.m, self.q, -1 if self.upper else 1
+        if not (len(edges) == len(q) == len(m) + 1 and edges[-1] == 0 and all(a < b for a, b in pairwise(edges))):
+            raise CertificateError("`proof.edges` must rise to 0, with one m less and as many q.")
+        if not all(rate >= 0 for rate in m) or q[0] != 0 or not all(value >= 0 for value in q):
+            raise CertificateError("`proof.m` must not be negative, and `proof.q` must rise from 0.")
+        if self.upper and not all(value < 1 for value in q):
+            raise CertificateError("`proof.q` must stay below 1.")
+        for (a, b), (left, right), rate in zip(pairwise(edges), pairwise(q), m):
+            slope = (arb(right) - left) / (arb(b) - a)
+            # convex in q, or (from below) concave
+            due = [(1 + sign * arb(end)) * (rate - arb(end)) for end in (left, right)]
+            top = (arb(rate) - 1) / 2
+            if not self.upper and not (top <= min(left, right) or top >= max(left, right)):
+                due.append((1 + arb(rate)) ** 2 / 4)
+            if not all(slope >= least for least in due):
+                raise Unproved("q was not shown to grow as fast as its inequality asks")
+
+    def least(self, low: Array, high: Array) -> Array:
+        """The least m of the levels in [low, min(high, 0)]."""
+        found = np.full(low.shape, np.inf)
+        for (a, b), rate in zip(pairwise(self.edges), self.m):
+            found = np.where((low <= b) & (high >= a), np.minimum(found, rate), found)
+        return np.where((low > self.edges[0]) & np.isfinite(found), found, 0.0)
+
+    def above(self, level: arb) -> arb:
+        """At least the integral of q from a level to 0."""
+        total = arb(0)
+        for (a, b), (left, right) in zip(pairwise(self.edges), pairwise(self.q)):
+            start = arb.max(arb.min(level, arb(b)), arb(a))
+            share = (arb(b) - start) / (arb(b) - a)
+            total += (arb(right) - (arb(right) - left) * share / 2) * (arb(b) - start)
+        return total
+
+
 def _derived(basis: Array, order: int) -> Array:
     """Coefficients of the basis' derivative."""
     for _ in range(order):
         basis = np.arange(1, len(basis))[:, None] * basis[1:]
     return basis
+
+
+def _restricted(basis: Array, parts: int, number: int) -> Array:
+    """The same by powers of xi' in [-1, 1], xi = c + xi' / parts: exact, as all of it are multiples of a power of 2."""
+    middle, count = (2 * number + 1) / parts - 1, len(basis)
+    rows = [[math.comb(r, s) * middle ** (r - s) / parts**s if s <= r else 0.0 for r in range(count)]
+            for s in range(count)]  # fmt: skip
+    return np.array(rows) @ basis
 
 
 def _along(matrix: Array, array: Array, axis: int) -> Array:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,7 +37,7 @@ from certbound.checker.statement import Model, SafeSet
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.batches import Array, Batch, Index, Mask, Terms, above, below, terms
-from certbound.checker.values.hermite import Patches, Surface
+from certbound.checker.values.hermite import Levels, Patches, Surface
 from certbound.checker.values.step_back import independent
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
@@ -49,53 +49,11 @@ _FAR = 40.0
 """Standard deviations of a random start beyond the grid that are looked at from below."""
 _DEGREES = {1: (6, 8), 2: (6, 8, 10, 12)}
 """Of the Taylor models by the number of states: higher ones where lower ones do not show what the file states."""
+_CUT = {1: ((8, 2),), 2: ((8, 2), (12, 2))}
+"""Degrees on so many parts of a patch along every axis, where no degree served on all of it."""
 _LEAST = 2.0**-20  # V is at least so far below 0 where paths end that have not left, so that exp(V) is not 1
 _ENTRIES = 4_000_000
 _CHUNK = 4096
-
-
-@dataclass(frozen=True, eq=False)
-class Levels:
-    """m between ``edges`` (rising, the last one 0) and q at them, for a bound from above or from below."""
-
-    edges: list[float]
-    m: list[float]
-    q: list[float]
-    upper: bool = True
-
-    def __post_init__(self) -> None:
-        edges, m, q, sign = self.edges, self.m, self.q, -1 if self.upper else 1
-        if not (len(edges) == len(q) == len(m) + 1 and edges[-1] == 0 and all(a < b for a, b in pairwise(edges))):
-            raise CertificateError("`proof.edges` must rise to 0, with one m less and as many q.")
-        if not all(rate >= 0 for rate in m) or q[0] != 0 or not all(value >= 0 for value in q):
-            raise CertificateError("`proof.m` must not be negative, and `proof.q` must rise from 0.")
-        if self.upper and not all(value < 1 for value in q):
-            raise CertificateError("`proof.q` must stay below 1.")
-        for (a, b), (left, right), rate in zip(pairwise(edges), pairwise(q), m):
-            slope = (arb(right) - left) / (arb(b) - a)
-            # convex in q, or (from below) concave
-            due = [(1 + sign * arb(end)) * (rate - arb(end)) for end in (left, right)]
-            top = (arb(rate) - 1) / 2
-            if not self.upper and not (top <= min(left, right) or top >= max(left, right)):
-                due.append((1 + arb(rate)) ** 2 / 4)
-            if not all(slope >= least for least in due):
-                raise Unproved("q was not shown to grow as fast as its inequality asks")
-
-    def least(self, low: Array, high: Array) -> Array:
-        """The least m of the levels in [low, min(high, 0)]."""
-        found = np.full(low.shape, np.inf)
-        for (a, b), rate in zip(pairwise(self.edges), self.m):
-            found = np.where((low <= b) & (high >= a), np.minimum(found, rate), found)
-        return np.where((low > self.edges[0]) & np.isfinite(found), found, 0.0)
-
-    def above(self, level: arb) -> arb:
-        """At least the integral of q from a level to 0."""
-        total = arb(0)
-        for (a, b), (left, right) in zip(pairwise(self.edges), pairwise(self.q)):
-            start = arb.max(arb.min(level, arb(b)), arb(a))
-            share = (arb(b) - start) / (arb(b) - a)
-            total += (arb(right) - (arb(right) - left) * share / 2) * (arb(b) - start)
-        return total
 
 
 class Passage:
@@ -133,6 +91,10 @@ class Passage:
         """What else the file states."""
         return [] if self.upper_side else ["side"] if self.random else ["side", "starts"]
 
+    def _first(self) -> float:
+        """When it begins."""
+        return 0.0
+
     def _last(self) -> float:
         """When it is over."""
         return self.model.horizon
@@ -144,7 +106,7 @@ class Passage:
         for name, row in [("times", times), *(("axes", axis) for axis in axes)]:
             if len(row) < 2 or not (np.diff(row) > 0).all():
                 raise CertificateError(f"`proof.{name}` must be two or more numbers that rise.")
-        if times[0] != 0 or times[-1] != self._last():
+        if times[0] != self._first() or times[-1] != self._last():
             raise Unproved("the slabs of time do not cover the horizon")
         if (len(times) - 1) * np.prod([len(axis) - 1 for axis in axes]) > MOST_PATCHES:
             raise CertificateError(f"`proof.axes` and `proof.times` must make at most {MOST_PATCHES} patches.")
@@ -157,41 +119,72 @@ class Passage:
         """At least the probability of leaving."""
         self._check_box()
         self.lift = self._missing()
+        return self.followed([self])
+
+    def followed(self, stages: Sequence[Passage]) -> arb:
+        """The same over stages that follow each other, this one being the first; all are lifted."""
         start = self._middle() if self.random else self._at_start()
         if not start < 0:
             return arb(1)
-        lam = self._payments(start)
         total, later, v0 = arb(0), arb(0), arb(start)
-        times = [arb(float(t)) for t in self.surface.times]
-        for k in reversed(range(len(lam))):
-            step = times[k + 1] - times[k]
-            later += arb(float(lam[k])) * step
-            total += arb(float(self.eps[k])) * step * later.exp()
+        for lam, eps in reversed([paid for stage in stages for paid in stage.paid(start)]):
+            later += lam
+            total += eps * later.exp()
         most = self.levels.above(arb(self.levels.edges[0]))
         if self.random:
             found = self._mean(lambda _, high: arb.min((later + most + arb(high)).exp(), arb(1)), lambda *_: True)
         else:
             found = (later + v0 + self.levels.above(v0)).exp()
         found += (v0 + most).exp() * total
-        floor = arb.min(arb(self._at_end()), arb(-_LEAST)).exp()
+        floor = arb.min(arb(stages[-1]._at_end()), arb(-_LEAST)).exp()
         return arb.min((found - floor) / (1 - floor), arb(1)).upper()
+
+    def paid(self, start: float) -> list[tuple[arb, arb]]:
+        """lam and eps of every slab, times its length."""
+        times = [arb(float(t)) for t in self.surface.times]
+        return [
+            (arb(float(lam)) * (b - a), arb(float(eps)) * (b - a))
+            for lam, eps, (a, b) in zip(self._payments(start), self.eps, pairwise(times))
+        ]
 
     def _check_box(self) -> None:
         """The box of the grid lies in the safe set, and the starts in it."""
         sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
         centre, radius = [(a + b) / 2 for a, b in sides], [(b - a) / 2 for a, b in sides]
-        if not SafeSet(self.model, bounded=False).holds(centre, radius):
+        if not self.limits().holds(centre, radius):
             raise Unproved("the grid was not shown to lie in the safe set")
         initial = self.model.initial
-        if not self.random and not all(
+        if self._first() == 0 and not self.random and not all(
             low >= a and high <= b for (a, b), low, high in zip(sides, initial.low, initial.high)
         ):
             raise Unproved("the initial set was not shown to lie in the grid")
 
+    def limits(self) -> SafeSet:
+        """The constraints that a path may break: without the domain where a path ends as it leaves that."""
+        model = self.model
+        return SafeSet(replace(model, constraints=model.constraints[:-1]) if model.ends else model, bounded=False)
+
+    def _spared(self) -> list[tuple[int, int]]:
+        """(state, end) of the sides by which a path ends that does not fail: where it has left the domain before."""
+        if not self.model.ends:
+            return []
+        return self.excluded(SafeSet(replace(self.model, constraints=self.model.constraints[-1:]), bounded=False))
+
+    def excluded(self, region: SafeSet) -> list[tuple[int, int]]:
+        """(state, end) of the sides of the grid that lie outside of a region."""
+        sides = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes]
+        found = []
+        for number, end in itertools.product(range(len(sides)), (0, 1)):
+            face = [(side[end], side[end]) if k == number else side for k, side in enumerate(sides)]
+            if region.excludes([(a + b) / 2 for a, b in face], [(b - a) / 2 for a, b in face]):
+                found.append((number, end))
+        return found
+
     def _missing(self) -> float:
-        """What V lacks of 0 on the sides of the box: V plus that has the same residual."""
-        sides = itertools.product(range(self.model.dimension), (0, 1))
-        return -min(0.0, *(float(self.across(axis, -side)[0].min()) for axis, side in sides))
+        """What V lacks of 0 on the sides by which paths fail: V plus that has the same residual."""
+        spared = self._spared()
+        sides = [side for side in itertools.product(range(self.model.dimension), (0, 1)) if side not in spared]
+        return -min([0.0, *(float(self.across(axis, -end)[0].min()) for axis, end in sides)])
 
     def across(self, axis: int, node: int) -> tuple[Array, Array]:
         """Ends of V, before it is lifted, where a state is at a node: over all patches, time slowest."""
@@ -221,10 +214,14 @@ class Passage:
 
     def _parts(self, patches: Patches, low: Sequence[Array], high: Sequence[Array]) -> tuple[Array, Array]:
         """Ends of V on the part of every patch of a frozen surface that lies between ``low`` and ``high``."""
+        return self.part_of(patches, low, high).sharp_ends()
+
+    def part_of(self, patches: Patches, low: Sequence[Array], high: Sequence[Array]) -> Batch:
+        """V on these parts, before it is lifted."""
         n = self.model.dimension
         whole = patches.derivative(terms(n + 1, 5 * n), (0,) * (n + 1))
         parts = [self._part(patches, i, low[i], high[i], whole.terms) for i in range(n)]
-        return _substituted(whole, parts).sharp_ends()
+        return _substituted(whole, parts)
 
     def _law(self) -> tuple[Array, Array, Array]:
         """Edges of the parts of the cells of one state, and ends of V(0, .) on each, V being lifted."""
@@ -262,11 +259,12 @@ class Passage:
         return total
 
     def _at_end(self) -> float:
-        """At most V at the horizon."""
+        """At most V at the horizon, and where paths end that do not fail."""
         n = self.model.dimension
         patches = self.surface.frozen(-1).patches(0, 1)
         low = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
-        return float(np.nextafter(low.min() + self.lift, -np.inf))
+        least = min([low.min(), *(self.across(axis, -end)[0].min() for axis, end in self._spared())])
+        return float(np.nextafter(least + self.lift, -np.inf))
 
     def _part(self, patches: Patches, i: int, low: Array, high: Array, which: Terms) -> Batch:
         """xi of a state on the part of every patch between ``low`` and ``high``."""
@@ -291,8 +289,9 @@ class Passage:
             if self.due is not None:  # nothing is asked where paths are over
                 here = np.flatnonzero(np.tile(self.due.ravel(), last - first))
                 patches, slab = patches.take(here), slab[here]
-            for degree, parts in (looks := [*((degree, 1) for degree in self.degrees), (self.degrees[-1], 2)]):
-                need = self._needs(patches, slab, start, degree, parts)
+            for degree, parts in (looks := [*((degree, 1) for degree in self.degrees), *_CUT[self.model.dimension]]):
+                needs = [self._needs(part, slab, start, degree) for part in patches.cut(parts)]
+                need = np.max(needs, axis=0)
                 settled = (need <= self.stated[slab]) | ((degree, parts) == looks[-1])
                 np.maximum.at(lam, slab[settled], need[settled])
                 rest = np.flatnonzero(~settled)
@@ -301,27 +300,27 @@ class Passage:
             raise Unproved("the dynamics was not shown to be defined where V is negative")
         return lam
 
-    def _needs(self, patches: Patches, slab: Index, start: float, degree: int, parts: int) -> Array:
-        """What every patch needs as lam, from Taylor models of some degree, bounded on equal parts."""
+    def _needs(self, patches: Patches, slab: Index, start: float, degree: int) -> Array:
+        """What every patch needs as lam, from Taylor models of some degree."""
         which = terms(self._variables(), degree)
         need, size = np.zeros(len(slab)), max(32, _ENTRIES // (degree + 1) ** which.variables)
         for first in range(0, len(slab), size):
             self.budget.check()
             part = slice(first, first + size)
-            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which, parts)
+            need[part] = self._need(patches.take(part), self.eps[slab[part]], start, which)
         return need
 
     def _variables(self) -> int:
         """Of the Taylor models: time, the states and the disturbances."""
         return 1 + self.model.dimension + len(self.model.disturbance)
 
-    def _need(self, patches: Patches, eps: Array, start: float, which: Terms, parts: int) -> Array:
+    def _need(self, patches: Patches, eps: Array, start: float, which: Terms) -> Array:
         low, high = patches.derivative(which, (0,) * (self.model.dimension + 1)).sharp_ends()
         low, high = np.nextafter(low + self.lift, -np.inf), np.nextafter(high + self.lift, np.inf)
         need, due = np.zeros(len(eps)), np.flatnonzero(~(low >= 0))
         if len(due):
             low, high = low[due], high[due]
-            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends(parts)[1]
+            excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends()[1]
             reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
             found = (excess - eps[due] * reach * (1 - 1e-12)) * (1 + 1e-12)
             need[due] = np.where(np.isfinite(excess), np.maximum(found, 0.0), np.inf)
@@ -338,7 +337,7 @@ class Passage:
 
     def _inputs(self, patches: Patches, which: Terms) -> list[Batch]:
         """Time and states."""
-        return [tm.variable(which, i, patches.low[i], patches.high[i]) for i in range(self.model.dimension + 1)]
+        return [patches.variable(which, i) for i in range(self.model.dimension + 1)]
 
     def _balance(
         self, patches: Patches, inputs: Sequence[Batch], a: list[list[Batch]], share: Array, off: Array

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 
@@ -18,7 +19,7 @@ from certbound.checker.values.crossing import Crossing
 from certbound.checker.values.normal_means import axis_table, mean_table
 from certbound.checker.values.passage import Passage
 from certbound.checker.values.piece_means import PieceTransition, pieces_of
-from certbound.checker.values.reaching import bound_failing_above, bound_failing_below
+from certbound.checker.values.reaching import bound_failing_above, bound_failing_below, check_stages
 from certbound.checker.values.step_back import (
     DEGREE,
     Grid,
@@ -52,6 +53,8 @@ def check_values(model: Model, value: object, budget: Budget) -> arb:
     with np.errstate(all="ignore"):  # what is no number is unknown
         if model.continuous and model.target is not None:
             return bound_failing_above(model, value, budget)
+        if model.continuous and isinstance(value, Mapping) and "stages" in value:
+            return check_stages(model, value, budget, upper=True)
         if model.continuous:
             return Passage(model, value, budget).upper()
         return _Discrete(model, value, budget, upper=True).bound()
@@ -64,6 +67,8 @@ def check_values_below(model: Model, value: object, budget: Budget) -> arb:
     with np.errstate(all="ignore"):
         if model.continuous and model.target is not None:
             return bound_failing_below(model, value, budget)
+        if model.continuous and isinstance(value, Mapping) and "stages" in value:
+            return check_stages(model, value, budget, upper=False)
         if model.continuous:
             return Crossing(model, value, budget).lower()
         return _Discrete(model, value, budget, upper=False).bound()

@@ -31,7 +31,7 @@ from certbound.values.chains import Drifting
 from certbound.values.continuous import ExitBounds, Lasting, Payment, Rate, SureExit, Surface, bound_lasting
 from certbound.values.discrete import FailureBounds
 
-Proposed = tuple[Surface, Payment]
+Proposed = tuple[Surface | tuple[Surface, ...], Payment]
 
 _COARSE = (0.04, 0.01, 0.0)  # of log P, for a smaller file
 _MORE_ROOM = 3  # in continuous time and two states
@@ -72,8 +72,6 @@ def values_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0)
         raise CertificateError("no lower bound was found.")
     if isinstance(answer.details, FailureBounds):
         return induction_proof(problem, answer, attempt, lower=True)
-    if problem.ending:
-        raise CertificateError("certificates of lower bounds count leaving the domain as failing in continuous time.")
     if isinstance(answer.details, Lasting):
         return _lasting(problem, attempt, above=False)
     if isinstance(answer.details, Rate) and answer.details.fast is not None:
@@ -143,16 +141,17 @@ def _passage(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]
         )
     if not found.proposed:
         raise CertificateError(
-            "no value function was found that a certificate can state: in one state it states limits and noise that do "
-            "not come, go or jump, in two states bounded boxes whose faces paths cross, no obstacles and no oblique or "
-            "curved limits."
+            "no value function was found that a certificate can state: in one state it states limits that do not move "
+            "and noise that does not jump, in two states bounded boxes that do not move and whose faces paths cross, "
+            "no obstacles and no oblique or curved limits."
         )
     if problem.reach is not None:
         return _entered(problem, *_enough(problem, found.proposed, effort), lower=False)
     best = min(payment.log for _, payment in found.proposed)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
-    surface, payment = next(pair for pair in found.proposed if pair[1].log <= best + share)
-    return _stated(problem, surface.raised(payment.lift), payment)
+    stages, payment = next(pair for pair in found.proposed if pair[1].log <= best + share)
+    raised = [surface.raised(payment.lift) for surface in _listed(stages)]
+    return _staged(problem, [_past_domain(problem, surface) for surface in raised], payment)
 
 
 def _crossing(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any]:
@@ -163,8 +162,9 @@ def _crossing(problem: Problem, found: ExitBounds, effort: int) -> dict[str, Any
         return _entered(problem, *_enough(problem, found.proposed_below, effort), lower=True)
     best = max(payment.log for _, payment in found.proposed_below)
     share = _COARSE[effort] * max(1.0, -0.1 * best)
-    surface, payment = next(pair for pair in found.proposed_below if pair[1].log >= best - share)
-    data = _stated(problem, replace(surface, axes=tuple(_spread(axis) for axis in surface.axes)), payment)
+    stages, payment = next(pair for pair in found.proposed_below if pair[1].log >= best - share)
+    moved = _beyond(problem, _listed(stages))
+    data = _staged(problem, moved, payment)
     data["side"] = "lower"
     if not problem.initial.random:
         data["starts"] = exact(some_starts(problem))
@@ -179,10 +179,66 @@ def _enough(problem: Problem, pairs: Sequence[Proposed], effort: int) -> Propose
     return next(pair for pair, level in zip(pairs, levels) if abs(level - levels[-1]) <= share)
 
 
-def _entered(problem: Problem, surface: Surface, payment: Payment, *, lower: bool) -> dict[str, Any]:
+def _listed(stages: Surface | tuple[Surface, ...]) -> tuple[Surface, ...]:
+    return (stages,) if isinstance(stages, Surface) else stages
+
+
+def _past_domain(problem: Problem, surface: Surface) -> Surface:
+    """With sides at which paths end, as they leave the domain, a little beyond it."""
+    if not problem.ending or problem.domain is None:
+        return surface
+    axes = [axis.copy() for axis in surface.axes]
+    for axis, low, high in zip(axes, problem.domain.low, problem.domain.high):
+        step = INWARD * (axis[-1] - axis[0])
+        axis[[0, -1]] += np.array([-step, step]) * (axis[[0, -1]] == np.array([low, high]))
+    return replace(surface, axes=tuple(axes))
+
+
+def _beyond(problem: Problem, stages: Sequence[Surface]) -> list[Surface]:
+    """Surfaces of a lower bound whose sides, and the nodes on faces of constraints, lie a little farther out."""
+    n, marks = problem.system.dimension, list[tuple[int, float, int]]()
+    steps = [INWARD * max(float(np.ptp(surface.axes[axis])) for surface in stages) for axis in range(n)]
+    for constraint in problem.constraints if _windowed(problem) else ():
+        around = constraint.region.hull()
+        for place, *ends in zip(constraint.region.places(n), around.lo.tolist(), around.hi.tolist()):
+            marks += [(place, end, sign) for end, sign in zip(ends, (-1, 1))]
+    found = []
+    for surface in stages:
+        axes = []
+        for place, (axis, step) in enumerate(zip(surface.axes, steps)):
+            moved = axis.copy()
+            ends = [problem.domain.low[place], problem.domain.high[place]] if problem.ending and problem.domain else []
+            moved[[0, -1]] += np.array([-step, step]) * ([end not in ends for end in axis[[0, -1]]])
+            for _, end, sign in (mark for mark in marks if mark[0] == place):
+                moved[1:-1] += sign * step * (np.abs(axis[1:-1] - end) <= 1e-14 * (1 + abs(end)))
+            axes.append(moved)
+        found.append(replace(surface, axes=tuple(axes)))
+    return found
+
+
+def _windowed(problem: Problem) -> bool:
+    return any(constraint.during is not None for constraint in problem.constraints)
+
+
+def _staged(problem: Problem, stages: Sequence[Surface], payment: Payment) -> dict[str, Any]:
+    """Value functions of stages that follow each other; of one, where no constraint has a window."""
+    if not _windowed(problem):
+        return _stated(problem, stages[0], payment)
+    shared, own, first = dict[str, Any](), list[dict[str, Any]](), 0
+    for surface in stages:
+        data, last = _stated(problem, surface, payment), first + surface.slabs
+        own.append({name: data.pop(name) for name in ("axes", "times", "values", "rates")})
+        own[-1] |= {name: data.pop(name)[first:last] for name in ("lam", "eps")}
+        shared, first = data, last
+    return shared | {"stages": own}
+
+
+def _entered(
+    problem: Problem, stages: Surface | tuple[Surface, ...], payment: Payment, *, lower: bool
+) -> dict[str, Any]:
     """A value function of a target. From below the grid keeps off the target, or has small cells around it."""
     assert problem.reach is not None
-    surface = surface.raised(payment.lift)
+    (surface,) = (one.raised(payment.lift) for one in _listed(stages))
     if lower:
         around, axes = problem.reach.region.hull(), [_spread(axis) for axis in surface.axes]
         places = problem.reach.region.places(problem.system.dimension)

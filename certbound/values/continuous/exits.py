@@ -36,6 +36,8 @@ from certbound.values.continuous.plane import (
 from certbound.values.continuous.room import limits_of, safe_room
 from certbound.values.continuous.surface import Surface
 
+Proposed = tuple[Surface | tuple[Surface, ...], Payment]
+
 _LN10 = math.log(10)
 
 
@@ -52,9 +54,9 @@ class ExitBounds:
     words : str
         What was done.
     seconds : float
-    proposed : tuple of (Surface, Payment)
+    proposed : tuple of (Surface or Surfaces of stages, Payment)
         V of every upper bound that was better than those before, and what it was paid with.
-    proposed_below : tuple of (Surface, Payment)
+    proposed_below : tuple of (Surface or Surfaces of stages, Payment)
         The same of the lower bounds.
     """
 
@@ -62,8 +64,8 @@ class ExitBounds:
     lower: float | None
     words: str
     seconds: float
-    proposed: tuple[tuple[Surface, Payment], ...] = ()
-    proposed_below: tuple[tuple[Surface, Payment], ...] = ()
+    proposed: tuple[Proposed, ...] = ()
+    proposed_below: tuple[Proposed, ...] = ()
 
 
 def bound_exits(
@@ -86,7 +88,8 @@ def bound_exits(
         How long to refine; the first attempt is finished in any case. In one state seconds stand for so many
         patches of work, so that the bounds do not depend on the machine or its load.
     lower : bool
-        Whether to look for a lower bound too.
+        Whether to look for a lower bound too. Where a path ends as it leaves its domain there is one in one state, for
+        limits that do not move and hold all the time; elsewhere leaving the domain counts as failing, from above.
     delta : float
         Where the upper bound is at most this, no lower bound is looked for in two states, which takes as long again.
     spare : bool
@@ -114,9 +117,9 @@ def bound_exits(
     """
     begin = time.perf_counter()
     _check(problem, target, seconds, most=3)
-    model = _model(problem)
-    proposed: Sequence[tuple[Surface, Payment]] = ()
-    below: Sequence[tuple[Surface, Payment]] = ()
+    model, ended = _model(problem), None
+    proposed: Sequence[Proposed] = ()
+    below: Sequence[Proposed] = ()
     if target is not None and problem.system.dimension == 2:
         from certbound.values.continuous.plane import bound_failing
 
@@ -128,9 +131,10 @@ def bound_exits(
         most, rest, words, (proposed, below) = bound_arrival(problem, model, target)
         upper, least = most, None if rest == -math.inf else rest
     elif problem.system.dimension == 1:
-        from certbound.values.continuous.line import bound_line
+        from certbound.values.continuous.line import bound_ended, bound_line
 
-        upper, least, words, (proposed, below) = bound_line(problem, model, seconds, lower)
+        ended = bound_ended(problem, model, seconds) if problem.ending else None
+        upper, least, words, (proposed, below) = ended or bound_line(problem, model, seconds, lower)
     elif problem.system.dimension == 3:
         from certbound.values.continuous.space import three_states
 
@@ -143,7 +147,7 @@ def bound_exits(
         upper, least, words = bound_moving(problem, model, begin + seconds, wanted)
     elif windowed(problem):
         _refuse_random(problem)
-        upper, least, words = bound_windows(problem, model, begin + seconds)
+        upper, least, words, (proposed, below) = bound_windows(problem, model, begin + seconds)
     elif walled(problem) and not (boxed(problem) and led(model)):
         _refuse_random(problem)
         upper, least, words, proposed = bound_region(problem, model, begin + seconds)
@@ -154,6 +158,8 @@ def bound_exits(
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
         way, room = (two_states, limits_of(problem)) if led(model) else (bound_plane, safe_room(problem))
         upper, least, words, (proposed, below) = way(problem, model, room, begin + seconds, wanted)
+    if problem.ending and ended is None:  # leaving the domain was counted as failing
+        least, below = None, ()
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),

@@ -26,9 +26,9 @@ from certbound.checker.values import batches as tm
 from certbound.checker.values import check_values_below, quadratic, walls
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.crossing import has_full_rank
-from certbound.checker.values.hermite import Surface
+from certbound.checker.values.hermite import Levels, Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
-from certbound.checker.values.passage import Levels, Passage
+from certbound.checker.values.passage import Passage
 from certbound.checker.values.quadratic import missing_form, splitting
 from certbound.checker.values.second_order import Flow
 from certbound.checker.values.step_back import Grid, Steps, Values
@@ -81,16 +81,16 @@ def test_taylor_models_hold_the_function_everywhere_on_their_boxes(function: Any
     high = low + rng.choice([0.0, 0.01, 0.2, 0.7], (2, 60))
     with np.errstate(all="ignore"):
         (found,) = run(tape, [tm.variable(which, i, low[i], high[i]) for i in range(2)])
-        ends, sharp, sharper = found.ends(), found.sharp_ends(), found.sharp_ends(3)
+        ends, sharp = found.ends(), found.sharp_ends()
     for xi in itertools.product((-1.0, -0.3, 0.55, 1.0), repeat=2):
         x = (low + high) / 2 + np.array(xi)[:, None] * (high - low) / 2
         truth = np.array([function(point)[0] for point in x.T])
         assert (np.abs(value_of(found, np.array(xi)) - truth) <= found.error + 1e-15).all()
-        for bottom, top in (ends, sharp, sharper):
+        for bottom, top in (ends, sharp):
             assert (truth >= bottom - 1e-15).all()
             assert (truth <= top + 1e-15).all()
     assert np.isfinite(found.error).mean() > 0.5
-    assert not ((sharper[0] < sharp[0] - 1e-9) | (sharper[1] > sharp[1] + 1e-9)).any()
+    assert not ((sharp[0] < ends[0] - 1e-9) | (sharp[1] > ends[1] + 1e-9)).any()
 
 
 def test_what_is_undefined_or_jumps_on_a_box_is_unknown() -> None:
@@ -204,6 +204,16 @@ def test_patches_have_the_stated_derivatives() -> None:
         for xi in ((0.0, 0.0, 0.0), (-1.0, 1.0, -1.0), (0.4, -0.7, 0.2)):
             t, x, y = (patches.low + patches.high) / 2 + np.array(xi)[:, None] * (patches.high - patches.low) / 2
             assert value_of(found, np.array(xi)) == pytest.approx(exact_one(t, x, y), abs=2e-4)
+        (part,) = (one for one in patches.cut(4) if one.numbers == (3, 0, 1))
+        fine, place = part.derivative(which, orders), (np.array([3, 0, 1]) * 2 + 1) / 4 - 1
+        assert fine.error.max() < 1e-9
+        for xi in ((0.0, 0.0, 0.0), (-1.0, 1.0, -1.0), (0.4, -0.7, 0.2)):
+            whole = place + np.array(xi) / 4
+            assert value_of(fine, np.array(xi)) == pytest.approx(value_of(found, whole), abs=1e-9)
+            for axis, ends in enumerate(zip(patches.low, patches.high)):
+                model = part.variable(which, axis)
+                truth = (ends[0] + ends[1]) / 2 + whole[axis] * (ends[1] - ends[0]) / 2
+                assert (np.abs(value_of(model, np.array(xi)) - truth) <= model.error).all()
 
 
 def test_the_bound_is_as_good_as_the_engines_and_above_its_lower_one() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import math
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from certbound.checker import check_data, parse
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.files.loading import loads
 from certbound.safety.certificate import problem_data
+from certbound.values.continuous.line import ladder
 from certbound.values.discrete import bound_failure, bound_long_run
 
 TEXT = """
@@ -113,11 +115,14 @@ def test_other_certificates_count_leaving_as_failing():
     assert problem_data(problem)["leaving"] == "ends"
 
 
-def test_other_engines_say_nothing_from_below():
+def test_value_functions_count_it_in_continuous_time_and_other_engines_say_nothing_from_below():
     system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=0.5)
     problem = cb.Problem(
         system, initial=[0.0], safe=[cb.Inside(cb.HalfSpace([1], 1))], horizon=1, domain=cb.Box([-0.5], [2]),
         leaving="ends", delta=1e-3,
     )  # fmt: skip
-    verdict = cb.verify_safety(problem, method="values", time_limit=5)
-    assert (verdict.status, verdict.log10_lower) == ("UNKNOWN", None)
+    with patch.object(ladder, "LADDER", ((1.5, 1e-2, 0.1), (2.5, 1e-3, 0.03))):
+        verdict = cb.verify_safety(problem, method="values", time_limit=5)
+    assert verdict.status == "UNSAFE"
+    assert -3 < verdict.log10_lower < verdict.log10_delta
+    assert cb.verify_safety(problem, method="linear").log10_lower is None

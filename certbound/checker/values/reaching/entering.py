@@ -107,15 +107,9 @@ class _ArrivingAbove(Passage):
         if not _target(self.model).excludes(*_box(self)):
             raise Unproved("the grid was not shown to keep off the target")
 
-    def _failing(self) -> list[Side]:
-        """The sides that break a constraint."""
-        safe = SafeSet(self.model, bounded=False)
-        return [(0, end) for end in (0, 1) if safe.excludes(*_box(self, (0, end)))]
-
-    def _missing(self) -> float:
-        failing = self._failing()
-        rest = [(0, end) for end in (0, 1) if (0, end) not in failing]
-        return -min([0.0, *(float(self.across(axis, -end)[0].min()) for axis, end in rest)])
+    def _spared(self) -> list[Side]:
+        """The sides that break a constraint: by these no path arrives."""
+        return self.excluded(SafeSet(self.model, bounded=False))
 
     def _at_start(self) -> float:
         sides, found = [(arb(float(axis[0])), arb(float(axis[-1]))) for axis in self.surface.axes], np.inf
@@ -125,10 +119,6 @@ class _ArrivingAbove(Passage):
             _, high = self._over([below(x) for x in point], [above(x) for x in point])
             found = min(found, float(high.max()))
         return float(np.nextafter(found + self.lift, np.inf))
-
-    def _at_end(self) -> float:
-        kept = [float(self.across(axis, -end)[0].min()) for axis, end in self._failing()]
-        return min([super()._at_end(), *(float(np.nextafter(value + self.lift, -np.inf)) for value in kept)])
 
 
 class _Cells:

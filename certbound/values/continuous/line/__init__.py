@@ -7,7 +7,7 @@ instead of the initial set), ``arrivals`` (targets), and by themselves ``station
 (horizons without an end) and, of any number of states, ``sure_exits`` (noise that leads every path out in the end).
 """
 
-from certbound.values.continuous.line.arrivals import bound_arrival
+from certbound.values.continuous.line.arrivals import bound_arrival, bound_ended
 from certbound.values.continuous.line.ladder import bound_line
 from certbound.values.continuous.line.maps import chart_line, chart_slabs
 from certbound.values.continuous.line.passages import Lasting, bound_lasting
@@ -16,6 +16,6 @@ from certbound.values.continuous.line.stationary import Rate, bound_mean_time, b
 from certbound.values.continuous.line.sure_exits import SureExit, leaves_surely
 
 __all__ = [
-    "Lasting", "Limit", "Phase", "Rate", "SureExit", "bound_arrival", "bound_lasting", "bound_line",
+    "Lasting", "Limit", "Phase", "Rate", "SureExit", "bound_arrival", "bound_ended", "bound_lasting", "bound_line",
     "bound_mean_time", "bound_rate", "chart_line", "chart_slabs", "check_room", "leaves_surely", "phase_of", "value_at",
 ]

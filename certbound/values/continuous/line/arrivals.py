@@ -30,6 +30,7 @@ from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]
+Bounds = tuple[float, float | None, str, ladder.Proposals]
 
 _RUNGS = 3
 _FLOOR = math.log(0.3)
@@ -65,9 +66,56 @@ def bound_arrival(
     early = _between(outer, (wide.low, small.high) if side == 1 else (small.low, wide.high), side, model, start)
     limited = wide.closed[1 - side]  # a path that passes a mere cut may come back and arrive
     least, most, done, proposed = _bounds(early if limited else None, late, (start, spread), side)
-    found = ", ".join(done) or "none came to an end"
-    words = f"value function in one state for arriving, cells x slabs of time: {found}"
+    words = f"value function in one state for arriving, cells x slabs of time: {_listed(done)}"
     return complement(least, up=True), complement(most, up=False), words, proposed
+
+
+def bound_ended(problem: Problem, model: Model, seconds: float) -> Bounds | None:
+    """The same as `bound_line` of P(failing) where a path ends as it leaves the domain; None where that says nothing.
+
+    Where both limits lie within the domain, it does not matter; where one does, failing is to arrive there before the
+    domain's other end, where e^V <= w (above: >= w) has to hold. None for limits that move or have windows, random
+    starts, and noise that vanishes between: there leaving the domain counts as failing.
+    """
+    domain, start = problem.domain, start_of(problem)
+    plain = problem.replace(domain=None, leaving="unsafe")
+    limits = limits_of(plain, inner=True)
+    still = all(limit.center is None and window == (0.0, float(problem.horizon)) for limit, window in limits)
+    if domain is None or start.random or not still:
+        return None
+    ends = float(domain.low[0]), float(domain.high[0])
+    failing = [
+        side for side, sign in ((0, 1), (1, -1))
+        if any(limit.side == side and sign * limit.offset > sign * ends[side] for limit, _ in limits)
+    ]  # fmt: skip
+    if len(failing) == 2:
+        return ladder.bound_line(plain, model, seconds, True)
+    if not failing:
+        return None
+    (side,) = failing
+    inner, outer = (ladder.room_of(plain, model, ends, start, inner=way) for way in (True, False))
+    if not ladder.is_plain(inner) or not ladder.is_plain(outer):
+        return None
+    pairs = [(ends[0], room.phases[0].high) if side == 1 else (room.phases[0].low, ends[1]) for room in (inner, outer)]
+    early, late = (_between(room, pair, side, model, start) for room, pair in zip((inner, outer), pairs))
+    wide = late.phases[0]
+    try:
+        check_noise(late.models[0], (wide.start, wide.end), [(wide.low, wide.high)])
+    except InfeasibleError:
+        return None
+    least, most, done, (below, above) = _bounds(early, late, (start, start), side, lowered=True)
+    if not most < 0 and least == -math.inf:
+        return None
+    words = f"value function in one state for failing before the domain is left, cells x slabs of time: {_listed(done)}"
+    return most, None if least == -math.inf else least, words, (_each(above), _each(below))
+
+
+def _each(found: list[Proposed]) -> list[ladder.Proposed]:
+    return [((surface,), payment) for surface, payment in found]
+
+
+def _listed(done: list[str]) -> str:
+    return ", ".join(done) or "none came to an end"
 
 
 def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start, Start]:
@@ -101,22 +149,26 @@ def _between(
 
 
 def _bounds(
-    early: ladder.Room | None, late: ladder.Room, starts: tuple[Start, Start], side: int
+    early: ladder.Room | None, late: ladder.Room, starts: tuple[Start, Start], side: int, *, lowered: bool = False
 ) -> tuple[float, float, list[str], tuple[list[Proposed], list[Proposed]]]:
-    """Natural logarithms of bounds of P(arriving): at least (first start), at most (some of the others)."""
+    """Natural logarithms of bounds of P(arriving): at least (first start), at most (some of the others).
+
+    With ``lowered`` w follows the bound found so far, so that small probabilities are not lost beside it.
+    """
     start, spread = starts
     proposed: tuple[list[Proposed], list[Proposed]] = ([], [])
     rough = ladder.sketches(late)
-    least, most, done = -math.inf, 0.0, list[str]()
+    least, most, done, floor = -math.inf, 0.0, list[str](), _FLOOR
     for fineness, tolerance, lead in ladder.LADDER[:_RUNGS]:
         share = lead / max(rough[0].growth, 1.0)
         try:
-            links = early and ladder.surface_of_arrival(early, side, rough, (share, fineness, tolerance, lead), _FLOOR)
+            floor = min(floor, most + _FLOOR) if lowered else floor
+            links = early and ladder.surface_of_arrival(early, side, rough, (share, fineness, tolerance, lead), floor)
             if links and spans(links, upper=True):
                 surface, above = _prove_above(links[0], spread, side)
                 proposed[1].extend([(surface, above)] if above.log < most else [])
                 most = min(most, above.log)
-            links = ladder.surfaces_below(late, start, rough, (share, fineness, 0.5 * tolerance, lead), _FLOOR)
+            links = ladder.surfaces_below(late, start, rough, (share, fineness, 0.5 * tolerance, lead), floor)
             if links is not None and spans(links, upper=False):
                 payment = prove_below(links, start)
                 done.append(f"{links[0].surface.cells[0]} x {links[0].surface.slabs}")

@@ -16,7 +16,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous.held_faces import check_noise, held_face, resolved
 from certbound.values.continuous.hypotheses import Model, raised_above
 from certbound.values.continuous.line.initial_law import Start, start_of
-from certbound.values.continuous.line.linked import Link, prove_above, prove_below, spans
+from certbound.values.continuous.line.linked import Link, prove_above, prove_below, raised_links, spans
 from certbound.values.continuous.line.moved_model import model_on, parts_of
 from certbound.values.continuous.line.phases import (
     Gate,
@@ -52,6 +52,9 @@ _RATE = 80_000.0
 _USUAL_SAMPLES = 63.0
 
 
+Proposed = tuple[tuple[Surface, ...], Payment]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Room:
     """One side's phases with their gates, models and lines."""
@@ -70,12 +73,12 @@ class _Found:
     lower: float | None = None
     done: list[str] = field(default_factory=list)
     work: float = 0.0
-    proposed: list[tuple[Surface, Payment]] = field(default_factory=list)
-    below: list[tuple[Surface, Payment]] = field(default_factory=list)
+    proposed: list[Proposed] = field(default_factory=list)
+    below: list[Proposed] = field(default_factory=list)
 
 
 Held = tuple[float | None, float | None]
-Proposals = tuple[list[tuple[Surface, Payment]], list[tuple[Surface, Payment]]]
+Proposals = tuple[list[Proposed], list[Proposed]]
 
 
 def bound_line(
@@ -118,6 +121,8 @@ def bound_line(
         if gain < _SMALL_GAIN or found.work + _DEARER * (found.work - before) > seconds * _RATE:
             break
     found.lower = _less(found.lower, leak)
+    if leak > -math.inf:  # of which certificates state nothing
+        found.below.clear()
     words = f"value function in one state, cells x slabs of time: {', '.join(found.done) or 'none came to an end'}"
     return found.upper, found.lower, words, (found.proposed, found.below)
 
@@ -264,8 +269,8 @@ def _raise_upper(
     found.work += _patches_in(links)
     payment = prove_above(links, start)
     gain = found.upper - payment.log
-    if gain > 0 and is_plain(room) and not any(links[0].held):
-        found.proposed.append((raised_above(links[0].surface), payment))
+    if gain > 0 and stands_still(room) and not any(links[0].held):
+        found.proposed.append((tuple(link.surface for link in raised_links(links)), payment))
     if any(links[0].held) and is_plain(room):
         _raise_shorter(found, room, start, rough, effort)
     found.upper = min(found.upper, payment.log)
@@ -282,7 +287,7 @@ def _raise_shorter(
     found.work += _patches_in(links)
     payment = prove_above(links, start)
     if payment.log < min([0.0, *(one.log for _, one in found.proposed)]):
-        found.proposed.append((raised_above(links[0].surface), payment))
+        found.proposed.append(((raised_above(links[0].surface),), payment))
         found.upper = min(found.upper, payment.log)
 
 
@@ -290,6 +295,14 @@ def is_plain(room: Room) -> bool:
     """Whether one surface in the state itself says all: limits that stand still over the whole horizon."""
     phase = room.phases[0]
     return len(room.phases) == 1 and phase.origin is None and phase.width is None and not is_gated(room, 0)
+
+
+def stands_still(room: Room) -> bool:
+    """Whether certificates state such stages: in the state itself, of one model."""
+    return all(
+        phase.origin is None and phase.width is None and model is room.models[0]
+        for phase, model in zip(room.phases, room.models)
+    )
 
 
 def _raise_lower(
@@ -304,8 +317,8 @@ def _raise_lower(
     if payment is None:
         return 0.0
     gain = math.inf if found.lower is None else payment.log - found.lower
-    if gain > 0 and is_plain(room) and not any(links[0].held):
-        found.below.append((links[0].surface, payment))
+    if gain > 0 and stands_still(room) and not any(links[0].held):
+        found.below.append((tuple(link.surface for link in links), payment))
     found.lower = payment.log if found.lower is None else max(found.lower, payment.log)
     return gain
 

@@ -64,16 +64,24 @@ def spans(links: Sequence[Link], *, upper: bool) -> bool:
     return all(a.phase.end == b.phase.start for a, b in itertools.pairwise(links))
 
 
-def prove_above(links: Sequence[Link], start: Start) -> Payment:
-    """An upper bound of log P over a chain, whatever its surfaces are."""
+def raised_links(links: Sequence[Link]) -> list[Link]:
+    """The chain with every surface raised by what it lacks; nothing where that is without bounds."""
     ready: list[Link] = []
     for link in reversed(links):
         after = ready[0] if ready else None
         surface = raised_above(link.surface, [link.held])
         missing = missing_upper(surface, link.phase, link.gate, (after.surface, after.phase) if after else None)
         if not math.isfinite(missing):
-            return Payment(log=0.0)
+            return []
         ready.insert(0, replace(link, surface=surface.raised(up(missing)) if missing else surface))
+    return ready
+
+
+def prove_above(links: Sequence[Link], start: Start) -> Payment:
+    """An upper bound of log P over a chain, whatever its surfaces are."""
+    ready = raised_links(links)
+    if not ready:
+        return Payment(log=0.0)
     level = up(start.highest(ready[0].surface, ready[0].phase))
     need = Need(spare=NEGLIGIBLE / (links[-1].phase.end - links[0].phase.start), start=level, top=0.0)
     proofs = [examine(link.surface, link.model, need, upper=True) for link in ready]

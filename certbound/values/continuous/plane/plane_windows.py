@@ -54,6 +54,8 @@ _CAP = 50.0
 _SHARE = 0.005  # of P: what V starts from, for lower bounds
 _LIFTS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.2)
 
+Proposed = tuple[tuple[Surface, ...], Payment]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Chain:
@@ -67,8 +69,10 @@ class _Chain:
     upper: bool
 
 
-def bound_windows(problem: Problem, model: Model, deadline: float) -> tuple[float, float | None, str]:
-    """Natural logarithms of an upper and a lower bound (None: there is none) of P(failing), and words.
+def bound_windows(
+    problem: Problem, model: Model, deadline: float
+) -> tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]:
+    """Natural logarithms of an upper and a lower bound (None: there is none), words, and what certificates state.
 
     Raises
     ------
@@ -90,18 +94,24 @@ def bound_windows(problem: Problem, model: Model, deadline: float) -> tuple[floa
     rough = _surfaces(above, _COARSE, 0.0, passes=0)
     level = 0.0 if rough is None else min(0.0, extreme_over(rough[0], starts, upper=True))
     upper, lower, done = 0.0, -math.inf, list[str]()
+    proposed, lowered = list[Proposed](), list[Proposed]()
     for cells in sorted({_cells(above.stages, share * patches) for share in _SHARES}):
         with contextlib.suppress(OutOfTime):
             surfaces = _surfaces(above, cells, level, passes=_PASSES)
-            upper = min(upper, 0.0 if surfaces is None else prove_chain_above(surfaces, above).log)
+            if surfaces is not None:
+                ready, payment = prove_chain_above(surfaces, above)
+                proposed += [(ready, payment)] if payment.log < upper else []
+                upper = min(upper, payment.log)
             surfaces = None if any(stage.cut for stage in below.stages) else _surfaces(
                 below, cells, min(level, upper), passes=_PASSES
             )
-            payment = None if surfaces is None else prove_chain_below(surfaces, below)
-            lower = max(lower, -math.inf if payment is None else payment.log)
+            least = None if surfaces is None else prove_chain_below(surfaces, below)
+            if surfaces is not None and least is not None and least.log > lower:
+                lowered.append((tuple(surfaces), least))
+                lower = least.log
         done.append(f"{cells}^2 in {len(above.stages)} stages")
     words = f"value function in two states, cells: {', '.join(done)}"
-    return upper, None if lower == -math.inf else lower, words
+    return upper, None if lower == -math.inf else lower, words, (proposed, lowered)
 
 
 def _cells(stages: Sequence[Stage], patches: float) -> int:
@@ -226,19 +236,19 @@ def _meeting(axes: Sequence[Array], stage: Stage) -> Mask:
     return np.asarray(np.logical_and.outer(*rows))
 
 
-def prove_chain_above(surfaces: Sequence[Surface], chain: _Chain) -> Payment:
-    """An upper bound of log P(failing) over the stages, whatever the surfaces are."""
+def prove_chain_above(surfaces: Sequence[Surface], chain: _Chain) -> Proposed:
+    """The surfaces, raised by what they miss, and an upper bound of log P(failing), whatever they are."""
     ready: list[Surface] = []
     for surface, stage in zip(reversed(surfaces), reversed(chain.stages)):
         if not _spans(surface, stage, within=True):
-            return Payment(log=0.0)
+            return (), Payment(log=0.0)
         surface = raised_above(surface)
         for _ in range(3):  # values are rounded when they are raised
             missing = missing_above(surface, stage, ready[0] if ready else None)
             if 0 < missing < math.inf:
                 surface = surface.raised(up(missing) + 1e-12)
         if missing > 0:
-            return Payment(log=0.0)
+            return (), Payment(log=0.0)
         ready.insert(0, surface)
     level = up(extreme_over(ready[0], chain.starts, upper=True))
     span = float(ready[-1].times[-1] - ready[0].times[0])
@@ -253,7 +263,7 @@ def prove_chain_above(surfaces: Sequence[Surface], chain: _Chain) -> Payment:
         parts = [patched_of(proof, proof.ranges.residual_high, need, steps, lift) for proof in proofs]
         payment = pay_upper(chained(parts, ready, need), up(level + lift), floor + lift - 1e-15 * (1 + abs(floor)))
         best = min(best, replace(payment, lift=lift), key=lambda one: one.log)
-    return best
+    return tuple(ready), best
 
 
 def prove_chain_below(surfaces: Sequence[Surface], chain: _Chain) -> Payment | None:
