@@ -228,7 +228,10 @@ def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
     setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
     turn, scout = leaving._turn(setting), leaving.scout_of(setting)
     assert leaving._affordable(setting, turn, 1.0, scout) == [leaving._PLANS[0]]
-    assert leaving._affordable(setting, turn, 1.7e6, scout)[-1] in leaving._PLANS[1:-1]
+    (some,), (more,) = (leaving._affordable(setting, turn, work, scout) for work in (1.7e6, 2.5e6))
+    assert 0 < nodes_of(setting, leaving._plan(setting, turn, *some, 1e-9), scout) < 1.7e6 / 2
+    assert all(finer <= coarser for finer, coarser in zip((more[0], *more[1]), (some[0], *some[1])))
+    assert more != some
 
 
 def test_the_steps_end_when_the_time_is_over() -> None:
@@ -278,7 +281,7 @@ def after(drift: float, pull: float, s: float, left: float) -> tuple[float, floa
 @pytest.mark.parametrize("drift", [-0.4, 0.1, 0.8])
 def test_whoever_met_a_face_counts_once_from_either_side_whatever_the_rest_of_the_step(drift, pull) -> None:
     s, h, depths = 1.0, 1.0, np.linspace(0, 14, 1401)
-    rate, factor = mirrors._paid((drift, pull), s, h, depths, (6.0, 0.15))
+    rate, factor = mirrors._paid((drift, pull), s, h, depths, (8.0, 0.15))
     face = mirrors._Face(
         most=np.array([drift]), least=np.array([drift]), pulls=(np.array([pull]),) * 2, window=np.zeros(1)
     )

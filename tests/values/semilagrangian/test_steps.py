@@ -207,11 +207,13 @@ def spoiled(matrix, mass, size: float, rng):
     return dense + size * near * rng.choice([-1.0, 1.0], near.shape)
 
 
-def spoiled_band(band: Band, q, size: float, rng) -> Band:
+def spoiled_band(band: Band, y, q, size: float, rng) -> Band:
     """All kernels of a band off by ``size`` in their own units."""
     one = band.one
-    names = ("rows", "cells", "spread")
-    one = replace(one, **{name: csr_array(spoiled(getattr(one, name), one.mass, size, rng)) for name in names})
+    names = ("rows", "spread")
+    bows = one.cells + (spoiled(0 * one.cells, one.mass, size, rng)) * 2 * np.diff(y[band.rows])[:, None]
+    others = {name: csr_array(spoiled(getattr(one, name), one.mass, size, rng)) for name in names}
+    one = replace(one, cells=csr_array(bows), **others)
     kernels = []
     for two in band.two:
         sigma = 1 / (math.sqrt(2 * math.pi) * two.sup[0].max())
@@ -237,7 +239,7 @@ def test_kernels_that_are_off_change_a_step_by_less_than_what_is_paid_for_roundi
         price = band.prices[5] * 2 * size / error
         free = replace(band, prices=np.concatenate([band.prices[:5], 0 * band.prices[5:]]))
         paid = replace(band, prices=np.concatenate([band.prices[:5], price[None]]))
-        looks = (free, spoiled_band(free, frame.q, size, rng), paid)
+        looks = (free, spoiled_band(free, frame.y, frame.q, size, rng), paid)
         exact, wrong, allowed = (through(one, frame, value, (flat, flat)) for one in looks)
         bent = np.abs(wrong[1] - exact[1]) * np.diff(frame.q) ** 2 / 8
         change = np.abs(wrong[0] - exact[0])[:-1, :-1] + np.abs(wrong[2] - exact[2]) + np.maximum(bent[1:], bent[:-1])
