@@ -23,9 +23,9 @@ from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
 from certbound.watch import OutOfTime, poll
 
-_RARE = 12_000
-"""What rare events cost a step in units of ``Plan.spare``: four events, in which a function of at most 3000 is lost."""
-_TALLEST = 2500.0
+_RARE = 560_000
+"""What rare events cost a step in units of ``Plan.spare``: four events, in which a function of `_TALLEST` is lost."""
+_TALLEST = 1.2e5
 _SHARE = 1e-3
 _PLANS = (
     (0.2, (0.7, 0.005, 0.3, 0.06)), (0.17, (0.9, 0.0035, 0.24, 0.02)), (0.16, (0.9, 0.003, 0.2, 0.013)),
@@ -40,7 +40,7 @@ _BETWEEN = 5
 _FIRST = 0.25  # share of the work that a first look may take where no scout tells how rare failing is
 _SPARE = 1e-9
 _CAUTION = 0.1  # for a scout's answer
-_RATE = 900_000
+_RATE = 800_000
 """Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes."""
 _PREPARED = 20
 _LEAST, _MOST = 8, 2000

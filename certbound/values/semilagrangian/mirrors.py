@@ -41,7 +41,7 @@ from certbound.values.semilagrangian.remainders import upper_tail
 _WIDE = ((3.5, 0.015), (4.25, 0.025), (5.0, 0.08), (6.0, 0.15))  # and the share that a factor may make up for
 _BELOW = (1, 0)  # which of these serve from below
 _BLIND = 0.75  # the same where the inside is not looked at, and e^{rate d} is cut off, like levels, at `_MOST`/10
-_MOST = 2000.0
+_MOST = 1e5
 _UP = 1 + 1e-9
 _SLACK = 1e-11  # for nodes that are mirror images up to rounding
 
