@@ -110,7 +110,7 @@ def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array
     longest = max(abs(rates[0]), abs(rates[1]))
     whole = longest * _kinked(window, kinks, mesh, longest)
     if rates[0] <= 0.0 <= rates[1]:
-        return whole
+        return float(whole)
     sign = 1.0 if rates[0] > 0.0 else -1.0
     slow, fast = min(abs(rates[0]), abs(rates[1])), longest
     start, stop = (ends[0], ends[1]), (ends[2], ends[3])
@@ -127,7 +127,7 @@ def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array
         if early <= late:
             nearest = min(max(0.5, early), late)
             total += most * nearest * (1 - nearest)
-    return min(0.25 * whole, longest * total)
+    return float(min(0.25 * whole, longest * total))
 
 
 @compiled
