@@ -366,3 +366,11 @@ def test_cells_beside_a_face_pay_for_paths_that_leave_and_come_back_within_a_ste
             assert found <= paid[row, column]
             seen = max(seen, found)
     assert seen > 5e-4
+
+
+def test_where_paths_run_off_beyond_a_limit_the_other_state_is_looked_at_within_it() -> None:
+    system = cb.ContinuousSystem(lambda x: [x[1], x[0] ** 3 - x[0]], states=2, diffusion=[[0.0], [0.5]])
+    safe = [cb.Inside(cb.Box([-0.9], [0.9], coordinates=[0]))]
+    faces = setting_of(cb.Problem(system, initial=[0, 0], safe=safe, horizon=20)).faces
+    assert faces[0] == (-0.9, 0.9)
+    assert max(np.abs(faces[1])) < 5
