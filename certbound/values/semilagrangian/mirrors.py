@@ -167,7 +167,7 @@ def mirrors_of(
                 (rates[0, line], factors[0, line]), blind[line] = found, unseen
                 window[line] = faces[k].window[line]
             for k in _BELOW:
-                found = _granted(faces[k], line, _WIDE[k][0], setting.noise, clock.step, depths)
+                found = _granted(faces[k], int(line), _WIDE[k][0], setting.noise, clock.step, depths)
                 rates[1, line], factors[1, line] = found
                 span[line] = faces[k].window[line]
                 if math.isfinite(rates[1, line]):
