@@ -38,6 +38,8 @@ class Scouted:
         The same, times the square of d_p log u and the cube of |d_q log u|.
     cells : (float, float)
         The grid's distances.
+    share : float
+        Of the paths that fail, roughly, from the worst start.
     """
 
     p: Array
@@ -46,6 +48,7 @@ class Scouted:
     steep_p: Array
     steep_q: Array
     cells: tuple[float, float]
+    share: float
 
 
 def scouted(
@@ -95,7 +98,9 @@ def scouted(
     if not (steep_p.any() and steep_q.any()):
         return None
     cells = float(axes[0][1] - axes[0][0]), float(axes[1][1] - axes[1][0])
-    return Scouted(p=p, q=q, visits=visits, steep_p=steep_p, steep_q=steep_q, cells=cells)
+    return Scouted(
+        p=p, q=q, visits=visits, steep_p=steep_p, steep_q=steep_q, cells=cells, share=float(first.max())
+    )  # fmt: skip
 
 
 def _chain(

@@ -21,7 +21,7 @@ from certbound.values.semilagrangian.smoothing import Lines, Rows, smoothed
 
 _UP = 1 + 1e-9
 NOWHERE = -1e300
-_NEGLECTED = 1.5e-19  # what smoothing does not see of a function of size 3000, beyond `REACH` standard deviations
+_NEGLECTED = 5e-23  # what smoothing does not see of a function of size 1, beyond `REACH` standard deviations
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -224,8 +224,12 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
     tables = [least]
     if band.apart > 0:
         tables.append(smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[1], least))
+    unseen = float(np.abs(value.nodal).max() + (np.abs(value.bend) * np.diff(frame.q) ** 2).max() / 8) * band.beyond
     between = band.apart * least.fourth  # whatever share of either a cell takes
-    found = [_landed(band, frame, mesh, replace(table, lift=table.lift + between)) for table in tables]
+    found = [
+        _landed(band, frame, mesh, replace(table, lift=table.lift + between, near=table.near + unseen))
+        for table in tables
+    ]
     found += found[: 2 - len(found)]
     share, live = band.share, band.live
     nodal = np.full((live.shape[0] + 1, live.shape[1] + 1), NOWHERE)
@@ -256,7 +260,7 @@ def _landed(band: Band, frame: Frame, mesh: Array, found: Rows) -> tuple[Array, 
         (found.sagging, found.sway),
     )  # fmt: skip
     wide = np.stack([found.bent, found.mixed, found.bowed])
-    close = np.stack([found.lean_y, found.lean_q, found.lift, found.near + band.beyond])
+    close = np.stack([found.lean_y, found.lean_q, found.lift, found.near])
     payment = over_cells(
         image, radius, band.live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), mesh,
         frame.q, tables, found.bend, found.kinks, band.reach, band.prices, wide, close,

@@ -4,9 +4,9 @@ With phi0 = (linear interpolation between rows) o m, m the flow, a path x(tau), 
 has the image (y(tau), w(tau)) and, in the sense of distributions,
     -phi0'' <= (-W'') w_t^2 - 2 X y_t w_t + |W_y| |y_tt| + |W_w| |w_tt| + sum_k (-KW_k)^+ |y_t| delta(tau - tau_k),
 tau_k where the path crosses the row Y_k. phi0 exceeds its chord by int G(tau, .) of that: at most tau (1 - tau)/2 times
-a bound of the density, and 1/4 a unit of mass; where y_t may vanish a kink exceeds the chord by at most its slope times
-the range of y. Of a bound that is linear in tau the mean and a sixth of the change are enough, as the integral of
-G(tau, s) (s - 1/2) is tau (1 - tau)/2 times (2 tau - 1)/6.
+a bound of the density, and tau_k (1 - tau_k) a unit of mass; where y_t may vanish a kink exceeds the chord by at most
+its slope times the range of y. Of a bound that is linear in tau the mean and a sixth of the change are enough, as the
+integral of G(tau, s) (s - 1/2) is tau (1 - tau)/2 times (2 tau - 1)/6.
 Along q the density goes into the parabola, along y it is paid as a constant.
 """
 
@@ -102,6 +102,35 @@ def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
 
 
 @compiled
+def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array) -> float:
+    """What kinks that a path crosses lift it above its chord: |y_t| tau (1 - tau) times each, tau where it does.
+
+    ``ends`` holds the ranges of y at both ends. Where y_t may vanish a kink costs its slope times the range of y.
+    """
+    longest = max(abs(rates[0]), abs(rates[1]))
+    whole = longest * _kinked(window, kinks, mesh, longest)
+    if rates[0] <= 0.0 <= rates[1]:
+        return float(whole)
+    sign = 1.0 if rates[0] > 0.0 else -1.0
+    slow, fast = min(abs(rates[0]), abs(rates[1])), longest
+    start, stop = (ends[0], ends[1]), (ends[2], ends[3])
+    if sign < 0.0:
+        start, stop = (-ends[1], -ends[0]), (-ends[3], -ends[2])
+    total = 0.0
+    for k in range(window[0] + 1, window[1] + 1):
+        most, place = 0.0, sign * mesh[k]
+        for c in range(window[2], window[3] + 1):
+            most = max(most, kinks[k, c])
+        early = max((place - start[1]) / fast, 1 - (stop[1] - place) / slow) - 1e-6
+        late = min((place - start[0]) / slow, 1 - (stop[0] - place) / fast) + 1e-6
+        early, late = max(early, 0.0), min(late, 1.0)
+        if early <= late:
+            nearest = min(max(0.5, early), late)
+            total += most * nearest * (1 - nearest)
+    return float(min(0.25 * whole, longest * total))
+
+
+@compiled
 def _window(mesh: Array, q: Array, y0: float, y1: float, w0: float, w1: float) -> Index:
     found = np.empty(4, dtype=np.intp)
     found[0], found[1] = _cell_of(mesh, y0), _cell_of(mesh, y1)
@@ -147,7 +176,7 @@ def along_q(
     """
     lines, columns = image.shape[1], image.shape[2] - 1
     curve, extra = np.zeros((lines, columns)), np.zeros((lines, columns))
-    rates = np.empty(6)
+    rates, places = np.empty(6), np.empty(4)
     for i in range(lines):
         for j in range(columns):
             below, above = i > 0 and live[i - 1, j], i < lines - 1 and live[i, j]
@@ -172,9 +201,10 @@ def along_q(
             mean = _mean_bent(window, q, ends, sag_w, rates, sags[0], sags[1])
             mean += _density(window, tables, rates, bend, 0.0)
             curve[i, j] = min(mean, _density(window, tables, rates, bend, 1.0)) / square
-            longest = max(abs(rates[0]), abs(rates[1]))
-            share = 1.0 if rates[0] <= 0.0 <= rates[1] else 0.25
-            extra[i, j] = share * longest * _kinked(window, kinks, mesh, longest)
+            for side in range(2):
+                slack = radius[0, i, j + side]
+                places[2 * side], places[2 * side + 1] = image[0, i, j + side] - slack, image[0, i, j + side] + slack
+            extra[i, j] = _crossed(window, kinks, mesh, places, rates)
     return curve, extra
 
 
@@ -200,8 +230,7 @@ def over_cells(
         itself), near.
     """
     found = np.zeros(live.shape)
-    rates = np.empty(6)
-    ends = np.empty(4)
+    rates, ends, places = np.empty(6), np.empty(4), np.empty(4)
     for i in range(live.shape[0]):
         for j in range(live.shape[1]):
             if not live[i, j]:
@@ -218,10 +247,12 @@ def over_cells(
                 rates[2 * axis], rates[2 * axis + 1] = d * slopes[2 * axis, i, j], d * slopes[2 * axis + 1, i, j]
                 rates[4 + axis] = bends[axis, i, j] * d * d
             window = _window(mesh, q, ends[0], ends[1], ends[2], ends[3])
-            longest = max(abs(rates[0]), abs(rates[1]))
-            share = 1.0 if rates[0] <= 0.0 <= rates[1] else 0.25
+            for a in range(2):
+                slack = bends[2, i, j] * e * e / 8 + max(radius[0, i + a, j], radius[0, i + a, j + 1])
+                places[2 * a] = min(image[0, i + a, j], image[0, i + a, j + 1]) - slack
+                places[2 * a + 1] = max(image[0, i + a, j], image[0, i + a, j + 1]) + slack
             total = max(_density(window, tables, rates, bend, 1.0), 0.0) / 8
-            total += share * longest * _kinked(window, kinks, mesh, longest)
+            total += _crossed(window, kinks, mesh, places, rates)
             total += _largest(window, close[2]) + prices[5, i, j] * _largest(window, close[3])
             total += prices[3, i, j] * _largest(window, close[0]) + prices[4, i, j] * _largest(window, close[1])
             window = _window(mesh, q, ends[0] - reach[i, j], ends[1] + reach[i, j], ends[2], ends[3])

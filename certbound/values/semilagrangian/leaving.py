@@ -23,21 +23,24 @@ from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
 from certbound.watch import OutOfTime, poll
 
-_RARE = 12_000
-"""What rare events cost a step in units of ``Plan.spare``: four events, in which a function of at most 3000 is lost."""
-_TALLEST = 2500.0
+_RARE = 560_000
+"""What rare events cost a step in units of ``Plan.spare``: four events, in which a function of `_TALLEST` is lost."""
+_TALLEST = 1.2e5
 _SHARE = 1e-3
 _PLANS = (
-    (0.2, (0.7, 0.005, 0.3, 0.06)), (0.16, (0.6, 0.0035, 0.27, 0.03)), (0.16, (0.6, 0.003, 0.24, 0.015)),
-    (0.13, (0.6, 0.0025, 0.22, 0.01)), (0.1, (0.5, 0.002, 0.22, 0.006)), (0.08, (0.5, 0.0016, 0.2, 0.004)),
+    (0.2, (0.7, 0.005, 0.3, 0.06)), (0.17, (0.9, 0.0035, 0.24, 0.02)), (0.16, (0.9, 0.003, 0.2, 0.013)),
+    (0.13, (0.8, 0.0025, 0.18, 0.009)), (0.1, (0.7, 0.002, 0.17, 0.006)), (0.08, (0.6, 0.0016, 0.16, 0.004)),
 )  # fmt: skip
 """Lengths of the steps, relative to the time in which the flow turns by one radian, and cells, finer and finer.
 
-Shorter steps ask for smaller cells, since every step pays for its interpolation.
+Shorter steps ask for smaller cells, since every step pays for its interpolation. There are `_BETWEEN` plans from one to
+the next.
 """
-_FIRST = 0.25  # share of the work that a first look may take, which tells how rare failing is
-_SPARE = 1e-15
-_RATE = 900_000
+_BETWEEN = 5
+_FIRST = 0.25  # share of the work that a first look may take where no scout tells how rare failing is
+_SPARE = 1e-9
+_CAUTION = 0.1  # for a scout's answer
+_RATE = 800_000
 """Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes."""
 _PREPARED = 20
 _LEAST, _MOST = 8, 2000
@@ -78,7 +81,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     begin = time.process_time()
     setting = setting_of(problem)
     turn, scout = _turn(setting), scout_of(setting)
-    best, least, failed, done, spare = 1.0, 0.0, None, [], _SPARE
+    best, least, failed, done = 1.0, 0.0, None, []
+    spare = _SPARE if scout is None else _CAUTION * _SHARE * scout.share
     chosen = _affordable(setting, turn, _RATE * round(seconds, 1), scout)
     for k, (ratio, cells) in enumerate(chosen):
         plan = _plan(setting, turn, ratio, cells, spare)
@@ -95,7 +99,7 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
                 raise
             break
         done.append(f"{plan.count} steps")
-        spare = max(_SHARE * best / (_RARE * plan.count), 1e-200)
+        spare = _SHARE * best
     if failed is not None and not done:
         raise failed
     words = f"value function along the flow, {', '.join(done)}"
@@ -105,27 +109,42 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
 
 
 def _plan(setting: Setting, turn: float, ratio: float, cells: Cells, spare: float) -> Plan:
+    """``spare``: what all rare events may cost together."""
     count = min(max(_LEAST, math.ceil(setting.horizon / (ratio * turn))), _MOST)
     fine, wide, cell, loss = cells
-    return Plan(count=count, fine=fine, wide=wide, cell=cell, loss=loss, spare=min(spare, 0.01 / (_RARE * count)))
+    spare = max(min(spare, 0.01) / (_RARE * count), 1e-200)
+    return Plan(count=count, fine=fine, wide=wide, cell=cell, loss=loss, spare=spare)
+
+
+def _graded(grade: int) -> tuple[float, Cells]:
+    """One of the plans: `_PLANS`, and `_BETWEEN` - 1 from each to the next."""
+    k = min(grade // _BETWEEN, len(_PLANS) - 2)
+    one, two = (np.array([ratio, *cells]) for ratio, cells in _PLANS[k : k + 2])
+    ratio, *cells = (one * (two / one) ** (grade / _BETWEEN - k)).tolist()
+    return ratio, tuple(cells)
 
 
 def _affordable(
     setting: Setting, turn: float, work: float, scout: Scouted | None = None
 ) -> list[tuple[float, Cells]]:
-    """The finest of the plans whose nodes times steps are at most ``work``, after the coarsest if that costs little."""
-    chosen, first = _PLANS[0], math.inf
-    for ratio, cells in _PLANS:
-        plan = _plan(setting, turn, ratio, cells, _SPARE)
+    """The finest of the plans whose nodes times steps are at most ``work``; one that tells how rare failing is before.
+
+    That costs little, or is left out; where `scout` tells it, it is not needed.
+    """
+
+    def needed(grade: int) -> float:
+        plan = _plan(setting, turn, *_graded(grade), _SPARE)
         try:
-            needed = nodes_of(setting, plan, scout) * (2 * plan.count + _PREPARED)  # from above and from below
+            return nodes_of(setting, plan, scout) * (2 * plan.count + _PREPARED)  # from above and from below
         except InfeasibleError:  # shorter steps may do
-            continue
-        first = min(first, needed)
-        if needed > work:
-            break
-        chosen = ratio, cells
-    return [_PLANS[0], chosen] if chosen != _PLANS[0] and first < _FIRST * work else [chosen]
+            return 0.0
+
+    low, high = 0, _BETWEEN * (len(_PLANS) - 1) + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if needed(middle) <= work else (low, middle)
+    looks = scout is None and low > 0 and 0 < needed(0) < _FIRST * work
+    return [_graded(0), _graded(low)] if looks else [_graded(low)]
 
 
 def scout_of(setting: Setting) -> Scouted | None:

@@ -1,22 +1,25 @@
 """Beyond a face of the noise: what a function must be there (upper bounds), and may be there (lower bounds).
 
 A path that meets the face q = c at the time tau is at the depth d = q_h - c beyond it (d < 0: back inside) at the end
-of the step. Were d's drift a constant -gamma, its density p would have p(-d) = e^{rate d} p(d), rate = 2 gamma/s^2. So
-if m(d) is what is counted at the depth -d inside, and
+of the step, u = h - tau later. Were its inward drift gamma + k d, with constants gamma and k, d would be normal with
+the mean -gamma (1 - e^{-ku})/k and the variance v_u = s^2 (1 - e^{-2ku})/(2k), and its density p would have p(-d) =
+e^{rate d} p(d), rate = (2 gamma/s^2) 2/(1 + e^{-ku}). So if m(d) is what is counted at the depth -d inside, and
 
     1 + e^{rate d} (1 - m(d))
 
-at the depth d beyond, the mean of what is counted is exactly 1, whatever tau is. *Upper bounds:* with gamma >= 0 the
-largest inward drift, and m falling with d and below the function inside, this rises with d, so that a larger drift
-only counts more: the path is counted at least once. *Lower bounds:* with gamma the least inward drift and m above the
-function inside, it is counted at most once (where this does not rise with d, it is made smaller until it does).
+at the depth d beyond, the mean of what is counted is exactly 1. *Upper bounds:* with an inward drift of at most gamma +
+k d, gamma >= 0, the largest such rate over u, and m falling with d and below the function inside, this rises with d, so
+that a path that comes farther out (it does: compare the two equations) only counts more: the path is counted at least
+once. *Lower bounds:* with an inward drift of at least gamma + k d, the least rate and m above the function inside, it
+is counted at most once (where this does not rise with d, it is made smaller until it does).
 
 The inside is looked at within a window of y that a path may cross in a step. The drift is bounded within w standard
 deviations of the face; a share of at most 6 Phi(-w) of the paths comes farther or leaves the window (after the turn of
-the drift, which e^{rate d} is: 6 Phi(-(w - 2 gamma sqrt(h)/s))), which a factor makes up for. From above e^{rate d} is
-cut off at `_MOST`, and what is lost beyond the last node before is made up for as well. Where that is too much for what
-is beyond alone, the inside is not looked at (m = 0): then all that is counted makes up for it. Where this is too much,
-too, 1/Phi(-gamma sqrt(h)/s) stands beyond the face: the noise of the rest outweighs the drift that often.
+the drift by rate s e^{-k(u - r)}, which e^{rate d} is: 6 Phi(-(w - 2 turn)), turn = rate S/2 with S = s sqrt(h) max(1,
+e^{-kh}) >= sqrt(v_u)), which a factor makes up for. From above e^{rate d} is cut off at `_MOST`, and what is lost
+beyond the last node before is made up for as well. Where that is too much for what is beyond alone, the inside is not
+looked at (m = 0): then all that is counted makes up for it. Where this is too much, too, 1/Phi(-turn) stands beyond the
+face: the noise of the rest outweighs the drift that often.
 
 Paths that met the face at one place come to several lines of y, and each of these three means holds where all lines
 count like that. The drift is at most that of the line where it is least, which is of the first kind among them. So
@@ -40,9 +43,9 @@ from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.remainders import upper_tail
 
 _WIDE = ((3.5, 0.015), (4.25, 0.025), (5.0, 0.08), (6.0, 0.15))  # and the share that a factor may make up for
+_BELOW = (1, 0)  # which of these serve from below
 _BLIND = 0.75  # the same where the inside is not looked at, and e^{rate d} is cut off, like levels, at `_MOST`/10
-_MOST = 2000.0
-_SPARED = 8e-3  # more than 6 times (1 + e) Phi(-3.5)
+_MOST = 1e5
 _UP = 1 + 1e-9
 _SLACK = 1e-11  # for nodes that are mirror images up to rounding
 
@@ -130,10 +133,14 @@ class Mirror:
 class _Face:
     """What paths do that end on the lines of y and have met a face of q in the step, shape (ny,) each.
 
-    ``inward``: the range of q's drift since then; ``window``: how far apart paths from one place end.
+    Since then q's inward drift at the depth d beyond the face (d < 0: inside) is at most ``most`` + ``pulls[0]`` d and
+    at least ``least`` + ``pulls[1]`` d (infinite where that is not known); ``window``: how far apart paths from one
+    place end.
     """
 
-    inward: Interval
+    most: Array
+    least: Array
+    pulls: tuple[Array, Array]
     window: Array
 
 
@@ -151,24 +158,29 @@ def mirrors_of(
         places = np.arange(beyond[0], len(q) if side else -1, 1 if side else -1)
         depths = np.abs(q[beyond] - end)
         rates, factors = np.full((3, len(y)), np.nan), np.ones((3, len(y)))  # inside looked at, not looked at; below
-        kind, window, own = np.full(len(y), -1), faces[-1].window.copy(), np.zeros(levels.shape)
+        kind, own = np.full(len(y), -1), np.zeros(levels.shape)
+        window, span = faces[-1].window.copy(), faces[-1].window.copy()
         for line in np.flatnonzero(np.isfinite(drift)):
-            most = [float(face.inward.hi[line]) for face in faces]
+            most = [(float(face.most[line]), float(face.pulls[0][line])) for face in faces]
             options = (
                 (k, unseen, _paid(most[k], setting.noise, clock.step, depths, _WIDE[k], blind=unseen))
                 for unseen in (False, True) for k in range(len(_WIDE))
             )  # fmt: skip
             k, unseen, found = next((option for option in options if option[-1]), (0, False, None))
             if found is None:
-                margin, level = _levelled([*most, float(drift[line])], setting.noise, clock.step)
+                margin, level = _levelled([*most, (float(drift[line]), 0.0)], setting.noise, clock.step)
                 own[line, _from(q, end, side, margin)] = level
                 kind[line] = 3 if margin > 0 else 2
             else:
                 kind[line] = int(unseen)
                 rates[kind[line], line], factors[kind[line], line] = found
                 window[line] = faces[k].window[line]
-            least = float(faces[0].inward.lo[line])
-            rates[2, line], factors[2, line] = _granted(least, setting.noise, clock.step, depths)
+            for k in _BELOW:
+                found = _granted(faces[k], int(line), _WIDE[k][0], setting.noise, clock.step, depths)
+                rates[2, line], factors[2, line] = found
+                span[line] = faces[k].window[line]
+                if math.isfinite(rates[2, line]):
+                    break
         spread = np.maximum.reduce([face.window for face in faces])
         around = _window(y, np.where((kind > 1) & (spread == 0), np.inf, spread))  # 0: not known
         levels = np.maximum(levels, _alike(kind, rates, factors, own, around))
@@ -182,7 +194,7 @@ def mirrors_of(
             above.append(replace(mirror, rate=rates[1], factor=factors[1], blind=kind >= 0, most=_MOST / 10))
         if math.isfinite(setting.beyond[1][side]):
             below.append(replace(
-                mirror, rate=rates[2], factor=factors[2], blind=kind < -1, window=_window(y, faces[0].window),
+                mirror, rate=rates[2], factor=factors[2], blind=kind < -1, window=_window(y, span),
             ))  # fmt: skip
     return above, below, levels
 
@@ -234,43 +246,64 @@ def _from(q: Array, face: float, side: int, margin: float) -> slice:
     return slice(None, int(np.searchsorted(q, face + margin)) + 1)
 
 
+def _leading(inward: tuple[float, float], s: float, step: float) -> tuple[float, float]:
+    """The largest rate over all rests of a step, and S, for an inward drift gamma + k d; gamma counts as 0 at least."""
+    gamma, pull = max(inward[0], 0.0), inward[1]
+    growth = math.exp(-pull * step)
+    return 2 * gamma / s**2 * (2 / (1 + min(growth, 1.0))) * _UP, s * math.sqrt(step) * max(growth, 1.0) * _UP
+
+
 def _paid(
-    inward: float, s: float, step: float, depths: Array, wide: tuple[float, float], *, blind: bool = False
-) -> tuple[float, float] | None:
-    """The rate, and the factor that makes up for what is lost; None where that is too much."""
-    inward = max(inward, 0.0)
-    rate = 2 * inward / s**2 * _UP
-    turn = inward * math.sqrt(step) / s * _UP
-    if not math.isfinite(rate):
+    inward: tuple[float, float], s: float, step: float, depths: Array, wide: tuple[float, float], *,
+    blind: bool = False,
+) -> tuple[float, float] | None:  # fmt: skip
+    """The rate, and the factor that makes up for what is lost; None where that is too much. ``inward``: gamma and k."""
+    if not math.isfinite(inward[0]):
         return None
+    rate, size = _leading(inward, s, step)
+    turn = rate * size / 2 * _UP
     last = float(depths[rate * depths <= math.log(_MOST / 10 if blind else _MOST)][-1])
     lost = 6 * upper_tail(wide[0]) + 6 * upper_tail(wide[0] - 2 * turn)
-    lost += upper_tail(last / (s * math.sqrt(step)) - turn)
+    lost += upper_tail(last / size - turn)
     if blind:
         return (rate, _UP / (1 - lost)) if lost < _BLIND else None
     lost /= upper_tail(turn) / _UP**2  # only what is beyond makes up for it, and that counts at least P(d >= 0)
     return (rate, _UP / (1 - lost)) if lost < wide[1] else None
 
 
-def _levelled(inward: list[float], s: float, step: float) -> tuple[float, float]:
+def _levelled(inward: list[tuple[float, float]], s: float, step: float) -> tuple[float, float]:
     """A level, and from how far before the face on, for drifts that hold within `_WIDE`, and (the last) always."""
     best = 0.0
     for drift, wide in zip(inward, [*(wide for wide, _ in _WIDE), 38.0]):
-        beyond = upper_tail(max(drift, 0.0) * math.sqrt(step) / s * _UP) / _UP**2
-        best = max(best, beyond - 6 * upper_tail(wide))
+        if math.isfinite(drift[0]):
+            rate, size = _leading(drift, s, step)
+            best = max(best, upper_tail(rate * size / 2 * _UP) / _UP**2 - 6 * upper_tail(wide))
     if best * _MOST / 10 > 1:
         return 0.0, _UP / best
-    return max(min(inward[-2:]), 0.0) * step * _UP, TWICE
+    return min(max(gamma, 0.0) * max(math.exp(-pull * step), 1.0) for gamma, pull in inward[-2:]) * step * _UP, TWICE
 
 
-def _granted(inward: float, s: float, step: float, depths: Array) -> tuple[float, float]:
-    """The rate from below and the factor; (nan, 1) where paths may come too far, beyond the mirrored nodes."""
-    outward = max(-inward, 0.0) * math.sqrt(step) / s
-    if not math.isfinite(inward) or 4 * upper_tail(float(depths[-1]) / (s * math.sqrt(step)) - outward) > _SPARED / 2:
+def _granted(face: _Face, line: int, wide: float, s: float, step: float, depths: Array) -> tuple[float, float]:
+    """The rate from below and the factor; (nan, 1) where paths may come too far, beyond the mirrored nodes.
+
+    Beyond the face at most 1 + e is counted, so that 6 (1 + e) Phi(-w) bounds what is counted of paths for which the
+    drift's bounds do not hold; all others end among the mirrored nodes. It is taken from what lies beyond, where paths
+    end at least as often as with the largest drift.
+    """
+    most, least = float(face.most[line]), float(face.least[line])
+    if not math.isfinite(most):
         return math.nan, 1.0
-    share = _SPARED / (upper_tail(max(inward, 0.0) * math.sqrt(step) / s) / _UP**2)
-    rate = 2 * inward / s**2
-    return (rate - 1e-9 * abs(rate), 1 / (1 - share)) if share < 0.2 else (math.nan, 1.0)
+    pulls = [float(part[line]) for part in face.pulls]
+    far = max(
+        wide * s * math.sqrt(step) * (1 + abs(k) * step * grown) + max(abs(most), abs(least)) * step * grown
+        for k in pulls for grown in (math.exp(max(-k * step, 0.0)),)
+    )  # fmt: skip
+    rate, size = _leading((most, pulls[0]), s, step)
+    share = 6 * (1 + math.e) * upper_tail(wide) / upper_tail(rate * size / 2 * _UP) * _UP**2
+    if far * _UP > float(depths[-1]) or share > 0.2:
+        return math.nan, 1.0
+    rate = min(2 * least / s**2, 4 * least / s**2 / (1 + math.exp(-pulls[1] * step)))
+    return rate - 1e-9 * abs(rate), 1 / (1 - share)
 
 
 def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wide: float) -> _Face:
@@ -299,14 +332,23 @@ def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wi
     f, good = _rates(setting, path, near)
     slopes, bad, _ = evaluate(jacobian(setting.tape, (1, 2)), [Interval.point(np.zeros(len(y))), path, near])
     fine = fine & good & ~bad & np.isfinite(slopes.mag).reshape(len(y), -1).all(axis=1)
-    slope, width = slopes[:, 1], (f.hi[:, 1] - f.lo[:, 1])
+    slope, pull, width = slopes[:, 1], -slopes[:, 3], (f.hi[:, 1] - f.lo[:, 1])
     middle = np.abs(slope.mid)
     deviation = setting.noise * np.sqrt(h**3 / 3 * middle**2 + abs(clock.shear) * h**2 * middle + clock.shear**2 * h)
     spread = middle * h**2 / 2 * width + 2 * (wide + 1) * deviation + h * abs(clock.shear) * width
     spread += h * (2 * slopes[:, 0].mag * travel + 2 * slope.rad * away)
-    inward = -f[:, 1] if side else f[:, 1]
-    inward = Interval(np.where(fine, inward.lo, -np.inf), np.where(fine, inward.hi, np.inf))
-    return _Face(inward=inward, window=np.where(fine, spread, 0.0) * _UP)
+    at, good = _rates(setting, path, Interval.point(np.full(len(y), face)))
+    inward, start = (-part[:, 1] if side else part[:, 1] for part in (f, at))
+    fine = fine & good & np.isfinite(pull.mid)
+    k = np.where(fine, pull.mid, 0.0)
+    start = start + Interval(-1.0, 1.0) * (pull - k).mag * away
+    high = inward.hi < start.hi * 2 / (1 + np.exp(-np.maximum(k, 0.0) * h))  # one bound for all depths does better
+    low = inward.lo > start.lo
+    return _Face(
+        most=np.where(fine, np.where(high, inward.hi, start.hi), np.inf),
+        least=np.where(fine, np.where(low, inward.lo, start.lo), -np.inf),
+        pulls=(np.where(high, 0.0, k), np.where(low, 0.0, k)), window=np.where(fine, spread, 0.0) * _UP,
+    )  # fmt: skip
 
 
 def _rates(setting: Setting, p: Interval, q: Interval) -> tuple[Interval, Mask]:

@@ -185,7 +185,7 @@ def _closed(
             more = 1e-9 * (1 + abs(low) + abs(high)) if math.isfinite(low + high) else 0.0
             lows[place], highs[place] = max(lows[place], low - more), min(highs[place], high + more)
     if not np.isfinite([*lows, *highs]).all():
-        least, most = _reach(tape, noise, starts, horizon)
+        least, most = _reach(tape, noise, starts, horizon, np.array([lows, highs]))
         lows = [low if math.isfinite(low) else end for low, end in zip(lows, least)]
         highs = [high if math.isfinite(high) else end for high, end in zip(highs, most)]
     if not all(low < high for low, high in zip(lows, highs)):
@@ -193,10 +193,15 @@ def _closed(
     return (lows[0], highs[0]), (lows[1], highs[1])
 
 
-def _reach(tape: Tape, noise: float, starts: tuple[Ends, Ends], horizon: float) -> tuple[list[float], list[float]]:
-    """Ends of a box that hardly a path leaves, from simulated ones; any box will do, since leaving it counts."""
+def _reach(
+    tape: Tape, noise: float, starts: tuple[Ends, Ends], horizon: float, ends: Array
+) -> tuple[list[float], list[float]]:
+    """Ends of a box that hardly a path leaves, from simulated ones; any box will do, since leaving it counts.
+
+    Paths stop where they leave ``ends``, shape (2, 2), lows and highs: what has failed may run away.
+    """
     rng, drift = np.random.default_rng(0), compile_numpy(tape)
-    x = np.array([rng.uniform(*ends, _PATHS) for ends in starts])
+    x = np.array([rng.uniform(*places, _PATHS) for places in starts])
     least, most = x.min(axis=1), x.max(axis=1)
     step = horizon / _STEPS
     for _ in range(_STEPS):
@@ -204,7 +209,8 @@ def _reach(tape: Tape, noise: float, starts: tuple[Ends, Ends], horizon: float) 
             f = np.moveaxis(np.broadcast_to(drift(0.0, *x), (_PATHS, 2)), -1, 0)
         moved = x + step * f
         moved[1] += noise * math.sqrt(step) * rng.standard_normal(_PATHS)
-        x = np.where(np.isfinite(moved), moved, x)
+        inside = np.all((x >= ends[0][:, None]) & (x <= ends[1][:, None]) & np.isfinite(moved), axis=0)
+        x = np.where(inside, moved, x)
         least, most = np.minimum(least, x.min(axis=1)), np.maximum(most, x.max(axis=1))
     more = _BEYOND * (most - least)
     return (least - more).tolist(), (most + more).tolist()

@@ -5,7 +5,8 @@ with absolute values; sup over a cell is over all y of the cell [Y_k, Y_{k+1}].
 
     rows     E h_i(Y_k + s z)                       nodes from nodes
     spread   E h_k(y_i + s z), transposed           what a kink at y_i contributes to the kink of the rows at Y_k
-    cells    P(y_i + s z in cell k), transposed     how much of a kink at y_i falls into cell k
+    cells    E D tau (1 - tau), D tau = y_i + s z - Y_k in [0, D = D_k], transposed     what a unit of a kink at y_i
+             spread over cell k may bring about between its ends: a unit in the place tau does D tau (1 - tau)
     ceiling  sup over cell k of E h_i(y + s z)
     density  sup over cell k of phi_s(y - y_i)
     mass     min(1, D_i sup of phi over cell k - cell i), for s and for the wider s kappa
@@ -88,6 +89,7 @@ def along(nodes: Array, sigma: float, spread: float, rows: slice, lines: slice) 
     hats = _dense(forth, "hat", len(source))
     kinks = _dense(back, "hat", len(nodes[around]))[:, 1:-1].T
     whole = _dense(back, "whole", len(nodes[around]) - 1)[:, 1:-1].T
+    bows = _dense(back, "bubble", len(nodes[around]) - 1)[:, 1:-1].T * (2 / np.diff(mesh))[:, None]
     density = peak(mesh[:-1], mesh[1:], source, source, sigma)[0]
     widths, cells = np.diff(source), np.diff(mesh)
     bend = np.zeros(len(source))
@@ -97,7 +99,7 @@ def along(nodes: Array, sigma: float, spread: float, rows: slice, lines: slice) 
     from scipy.sparse import csr_array
 
     return Along(
-        rows=csr_array(hats), spread=csr_array(kinks), cells=csr_array(whole), ceiling=csr_array(ceiling),
+        rows=csr_array(hats), spread=csr_array(kinks), cells=csr_array(bows), ceiling=csr_array(ceiling),
         density=csr_array(density), mass=csr_array(_mass(mesh, source, sigma)),
         wide=csr_array(_mass(mesh, source, sigma, WIDER)), error=forth.error + back.error,
     )  # fmt: skip

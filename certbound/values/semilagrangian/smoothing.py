@@ -9,7 +9,7 @@ derivatives at the nodes) the mean is T(y, w) = sum_i E h_i(y + s_y z) V_i(w). E
   the slopes' derivatives S_i' (S_i = (V_{i+1} - V_i)/D_i) that supremum is a sum over kinks of L_i:
   V'''' = sum kappa_j phi'' - sum b_j int phi'', and so on with |phi'|, |phi| for lower orders;
 - d_yy T = sum_i K_i(w) phi(y - y_i), K_i = S_i - S_{i-1}; the rows' own kinks are KW_k = sum_i E h_k(y_i + s z) K_i;
-  between the rows T <= linear interpolation + (D_k/4) sum_i (-K_i)^+ P(y_i + s z in cell k);
+  between the rows T <= linear interpolation + sum_i (-K_i)^+ E D_k tau (1 - tau), tau where y_i + s z is in cell k;
 - d_ww T, |d_yw T|, |d_yy T| lie below sums with non-negative coefficients of densities or masses at kinks and cells:
   sum_i ceiling_ki sum_j (kappa_ij^+ + (-b_ij)^+ D_j) phi, sum_i mass_ki sum_j sup |d_q S_i| P, sum_i density_ki sum_j
   sup |K_i| P; with the supremum over s in [s_q, s_q stretch] they bound the means over a further N(0, (stretch^2 - 1)
@@ -143,7 +143,7 @@ def smoothed(
     rate = np.abs(np.diff(rows, axis=1)) / dq
     return Rows(
         values=rows, sagging=-(one.rows @ v2), sway=one.rows @ fourth, bend=bend, arch=one.rows @ mean,
-        kinks=one.spread @ drop, lift=dm / 4 * (one.cells @ np.maximum(drop, 0.0)) * _UP,
+        kinks=one.spread @ drop, lift=(one.cells @ np.maximum(drop, 0.0)) * _UP,
         cross_low=low, cross_high=high, bent=bent, mixed=mixed, bowed=bowed,
         steep_y=_ends(np.maximum, np.abs(np.diff(rows, axis=0)) / dm) + dq / 2 * np.maximum(np.abs(low), np.abs(high)),
         steep_w=np.maximum(rate[:-1], rate[1:]) + dq / 2 * np.maximum(inner, 0.0),

@@ -228,7 +228,10 @@ def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
     setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
     turn, scout = leaving._turn(setting), leaving.scout_of(setting)
     assert leaving._affordable(setting, turn, 1.0, scout) == [leaving._PLANS[0]]
-    assert leaving._affordable(setting, turn, 1.7e6, scout)[-1] in leaving._PLANS[1:-1]
+    (some,), (more,) = (leaving._affordable(setting, turn, work, scout) for work in (1.7e6, 2.5e6))
+    assert 0 < nodes_of(setting, leaving._plan(setting, turn, *some, 1e-9), scout) < 1.7e6 / 2
+    assert all(finer <= coarser for finer, coarser in zip((more[0], *more[1]), (some[0], *some[1])))
+    assert more != some
 
 
 def test_the_steps_end_when_the_time_is_over() -> None:
@@ -249,19 +252,51 @@ def test_beyond_a_face_nobody_counts_less_than_once() -> None:
     assert np.all(found >= 1)
 
 
+@pytest.mark.parametrize("pull", [-0.8, 0.0, 0.9])
 @pytest.mark.parametrize("drift", [0.3, 1.4, 1.7, 3.0])
-def test_whoever_met_a_face_counts_once_in_the_mean_where_the_inside_is_not_looked_at(drift) -> None:
+def test_whoever_met_a_face_counts_once_in_the_mean_where_the_inside_is_not_looked_at(drift, pull) -> None:
     s, h, depths = 1.0, 1.0, np.linspace(0, 8, 161)
-    found = mirrors._paid(drift, s, h, depths, (6.0, 0.15), blind=True)
-    assert found is not None or drift > 2
-    margin, level = mirrors._levelled([math.inf, drift], s, h)
+    found = mirrors._paid((drift, pull), s, h, depths, (6.0, 0.15), blind=True)
+    assert found is not None or math.prod(mirrors._leading((drift, pull), s, h)) > 3.8
+    margin, level = mirrors._levelled([(math.inf, 0.0), (drift, pull)], s, h)
     fine = (np.arange(40000) + 0.5) / 5000
     for left in np.linspace(0.01, h, 12):
-        density = np.exp(-((fine + drift * left) ** 2) / (2 * left)) / math.sqrt(2 * math.pi * left) / 5000
-        assert (density * level).sum() + (ndtr(math.sqrt(left) * drift) if margin else 0.0) >= 1 - 1e-6
+        mean, spread = after(drift, pull, s, left)
+        density = np.exp(-((fine - mean) ** 2) / (2 * spread**2)) / math.sqrt(2 * math.pi) / spread / 5000
+        assert (density * level).sum() + (ndtr(-mean / spread) if margin else 0.0) >= 1 - 1e-6
         if found is not None:
-            counted = 1 + np.exp(np.minimum(found[0] * np.interp(fine, depths, depths), math.log(200.0)))
-            assert 1 - 1e-6 <= (density * counted).sum() * found[1] <= 1.1 * found[1]
+            counted = 1 + np.exp(np.minimum(found[0] * np.interp(fine, depths, depths), math.log(mirrors._MOST / 10)))
+            total = (density * counted).sum()
+            assert total * found[1] >= 1 - 1e-6
+            assert pull != 0 or total <= 1.1
+
+
+def after(drift: float, pull: float, s: float, left: float) -> tuple[float, float]:
+    """Mean and standard deviation of the depth so long after a path has met 0, for the inward drift drift + pull d."""
+    mean = -drift * (left if pull == 0 else -math.expm1(-pull * left) / pull)
+    return mean, s * math.sqrt(left if pull == 0 else -math.expm1(-2 * pull * left) / (2 * pull))
+
+
+@pytest.mark.parametrize("pull", [-0.3, 0.0, 0.9])
+@pytest.mark.parametrize("drift", [-0.4, 0.1, 0.8])
+def test_whoever_met_a_face_counts_once_from_either_side_whatever_the_rest_of_the_step(drift, pull) -> None:
+    s, h, depths = 1.0, 1.0, np.linspace(0, 14, 1401)
+    rate, factor = mirrors._paid((drift, pull), s, h, depths, (6.0, 0.15))
+    face = mirrors._Face(
+        most=np.array([drift]), least=np.array([drift]), pulls=(np.array([pull]),) * 2, window=np.zeros(1)
+    )
+    under, share = mirrors._granted(face, 0, 4.25, s, h, depths)
+    assert (rate > 0) == (under > 0) == (drift > 0)
+    inside = 0.6 * np.exp(-depths)
+    for left in np.linspace(0.01, h, 9):
+        mean, spread = after(drift, pull, s, left)
+        weight = np.where(depths > 0, 0.01, 0.005) / math.sqrt(2 * math.pi) / spread
+        near, back = (weight * np.exp(-((sign * depths - mean) ** 2) / (2 * spread**2)) for sign in (1, -1))
+        above = (near * (1 + np.exp(rate * depths) * (1 - inside)) * factor + back * inside).sum()
+        below = (near * (1 + np.exp(under * depths) * (1 - inside)) / share + back * inside).sum()
+        assert below - 1e-4 <= 1 <= above + 1e-4
+        if pull == 0 and drift > 0:
+            assert above < 1.01 < below + 0.02
 
 
 def scouted_problem() -> cb.Problem:
@@ -337,14 +372,22 @@ def test_whoever_met_a_face_counts_once_in_the_mean_on_whichever_line_it_ends() 
     drifts, depths, fine = [0.9, 1.5, 2.2, 3.5], np.linspace(0, 8, 161), (np.arange(40000) + 0.5) / 5000
     rates, factors = np.full((2, 4), np.nan), np.ones((2, 4))
     for k in (0, 1):
-        rates[k, k], factors[k, k] = mirrors._paid(drifts[k], 1.0, 1.0, depths, (6.0, 0.15), blind=k == 1)
-    levels = np.array([0, 0, *(mirrors._levelled([math.inf, drift], 1.0, 1.0)[1] for drift in drifts[2:])])[:, None]
+        rates[k, k], factors[k, k] = mirrors._paid((drifts[k], 0.0), 1.0, 1.0, depths, (6.0, 0.15), blind=k == 1)
+    levels = np.array([0, 0, *(mirrors._levelled([(math.inf, 0.0), (drift, 0.0)], 1.0, 1.0)[1] for drift in drifts[2:])])[:, None]
     around = np.array([0, 0, 1, 2]), np.array([2, 3, 4, 4])  # paths come to a line and the next ones
     levels = mirrors._alike(np.arange(4), rates, factors, levels, around)
     found = levels + 0 * fine
-    for rate, factor, most in zip(rates, factors, (2000, 200)):
+    for rate, factor, most in zip(rates, factors, (mirrors._MOST, mirrors._MOST / 10)):
         asks = factor[:, None] * (1 + np.exp(np.minimum(rate[:, None] * fine, np.log(most))))
         found = np.maximum(found, np.where(np.isnan(asks), 0, asks))
     for first in range(3):  # such a path has the lesser drift, whatever its line is
         density = np.exp(-((fine + drifts[first]) ** 2) / 2) / math.sqrt(2 * math.pi) / 5000
         assert (density * np.minimum(found[first], found[first + 1])).sum() > 1 - 1e-6
+
+
+def test_where_paths_run_off_beyond_a_limit_the_other_state_is_looked_at_within_it() -> None:
+    system = cb.ContinuousSystem(lambda x: [x[1], x[0] ** 3 - x[0]], states=2, diffusion=[[0.0], [0.5]])
+    safe = [cb.Inside(cb.Box([-0.9], [0.9], coordinates=[0]))]
+    faces = setting_of(cb.Problem(system, initial=[0, 0], safe=safe, horizon=20)).faces
+    assert faces[0] == (-0.9, 0.9)
+    assert max(np.abs(faces[1])) < 5

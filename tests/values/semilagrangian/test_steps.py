@@ -17,7 +17,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete.dominance import KAPPA
-from certbound.values.semilagrangian import bands
+from certbound.values.semilagrangian import bands, landings
 from certbound.values.semilagrangian.backward import Bounds, back, limited
 from certbound.values.semilagrangian.bands import Band, Frame, through
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
@@ -207,11 +207,13 @@ def spoiled(matrix, mass, size: float, rng):
     return dense + size * near * rng.choice([-1.0, 1.0], near.shape)
 
 
-def spoiled_band(band: Band, q, size: float, rng) -> Band:
+def spoiled_band(band: Band, y, q, size: float, rng) -> Band:
     """All kernels of a band off by ``size`` in their own units."""
     one = band.one
-    names = ("rows", "cells", "spread")
-    one = replace(one, **{name: csr_array(spoiled(getattr(one, name), one.mass, size, rng)) for name in names})
+    names = ("rows", "spread")
+    bows = one.cells + (spoiled(0 * one.cells, one.mass, size, rng)) * 2 * np.diff(y[band.rows])[:, None]
+    others = {name: csr_array(spoiled(getattr(one, name), one.mass, size, rng)) for name in names}
+    one = replace(one, cells=csr_array(bows), **others)
     kernels = []
     for two in band.two:
         sigma = 1 / (math.sqrt(2 * math.pi) * two.sup[0].max())
@@ -237,7 +239,7 @@ def test_kernels_that_are_off_change_a_step_by_less_than_what_is_paid_for_roundi
         price = band.prices[5] * 2 * size / error
         free = replace(band, prices=np.concatenate([band.prices[:5], 0 * band.prices[5:]]))
         paid = replace(band, prices=np.concatenate([band.prices[:5], price[None]]))
-        looks = (free, spoiled_band(free, frame.q, size, rng), paid)
+        looks = (free, spoiled_band(free, frame.y, frame.q, size, rng), paid)
         exact, wrong, allowed = (through(one, frame, value, (flat, flat)) for one in looks)
         bent = np.abs(wrong[1] - exact[1]) * np.diff(frame.q) ** 2 / 8
         change = np.abs(wrong[0] - exact[0])[:-1, :-1] + np.abs(wrong[2] - exact[2]) + np.maximum(bent[1:], bent[:-1])
@@ -245,6 +247,38 @@ def test_kernels_that_are_off_change_a_step_by_less_than_what_is_paid_for_roundi
         assert np.all(change[band.live] <= room[band.live])
         shares.append(float((change[band.live] / room[band.live]).max()))
     assert max(shares) > 1e-6  # it is not paid a million times
+
+
+def test_between_rows_a_concave_kink_costs_at_least_what_it_brings_about_and_little_more() -> None:
+    y, sigma = np.cumsum([0.0, *[0.05] * 8, *[0.3] * 8]), 0.1
+    rows = slice(4, 13)
+    paid = along(y, sigma, 1e-15, rows, slice(0, len(y))).cells.toarray()
+    mesh, ratios = y[rows], []
+    for i, k in itertools.product(range(len(y)), range(len(mesh) - 1)):
+        z = (np.linspace(mesh[k], mesh[k + 1], 41) - y[i]) / sigma
+        mean = -sigma * (z * ndtr(z) + np.exp(-z * z / 2) / math.sqrt(2 * math.pi))  # of -max(y + s Z - y_i, 0)
+        excess = float((mean - np.linspace(mean[0], mean[-1], 41)).max())
+        assert excess <= paid[k, i] + 1e-12
+        ratios += [excess / paid[k, i]] if excess > 1e-6 else []
+    assert max(ratios) > 0.7
+
+
+def test_kinks_that_an_image_crosses_cost_at_least_what_they_lift_it_above_its_chord(rng) -> None:
+    mesh, tau, ratios = np.array([0.0, 0.3, 0.5, 0.9, 1.4]), np.linspace(0, 1, 201), []
+    kinks = rng.uniform(0, 2, size=(len(mesh), 1)) * [[0], [1], [1], [1], [0]]
+    window = np.array([0, 3, 0, 0])
+    for sign, width in itertools.product((1.0, -1.0), (0.0, 0.05, 0.2)):
+        for low in np.add(rng.uniform(0.0, 0.4, size=(30, 1)), [[0.0, rng.uniform(0.3, 0.8)]]):
+            low = low[::-1] if sign < 0 else low
+            ends = np.array([low[0], low[0] + width, low[1], low[1] + width])
+            one, two = low + width * rng.uniform(0, 1, 2)
+            rates = np.array([ends[2] - ends[1], ends[3] - ends[0], 0, 0, 0, 0])
+            line = -(kinks[:, 0] * np.maximum(one + (two - one) * tau[:, None] - mesh, 0)).sum(axis=1)
+            excess = float((line - np.linspace(line[0], line[-1], 201)).max())
+            paid = landings._crossed(window, kinks, mesh, ends, rates)
+            assert excess <= paid + 1e-12
+            ratios.append(excess / paid if paid > 0 else 0.0)
+    assert max(ratios) > 0.99
 
 
 def test_rounding_sees_the_lines_that_are_near(rng) -> None:
