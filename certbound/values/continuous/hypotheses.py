@@ -291,24 +291,29 @@ def _above(values: Array, lift: float) -> Array:
 
 
 def prove_lower(
-    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None
+    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
+    cut: Sequence[Sides] = (),
 ) -> Payment | None:
-    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
+    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is.
+
+    Leaving it by a face that is no limit (``cut``) does not count: exp(V) there is no more than what is subtracted.
+    """
     if extreme_over(surface, starts, upper=False, points=points) == -math.inf:
         return None
-    return proved_lower(surface, model, starts, points)[0]
+    return proved_lower(surface, model, starts, points, cut=cut)[0]
 
 
 def proved_lower(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
-    negligible: float = NEGLIGIBLE,
+    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (),
 ) -> tuple[Payment | None, Proof]:
     """The same with what was seen, where some start lies in the grid; ``negligible`` stands for `NEGLIGIBLE`."""
     surface = _sunk(surface)
     start = -up(-extreme_over(surface, starts, upper=False, points=points))
     need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf)
     proof = examine(surface, model, need, upper=False)
-    return _earned(proof, need, surface, start), proof
+    ends = [surface.face_range(axis, side)[1] for axis, sides in enumerate(cut) for side in (0, 1) if sides[side]]
+    return _earned(proof, need, surface, start, max(ends, default=-math.inf)), proof
 
 
 def _sunk(surface: Surface) -> Surface:
@@ -317,11 +322,12 @@ def _sunk(surface: Surface) -> Surface:
     return surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface
 
 
-def _earned(proof: Proof, need: Need, surface: Surface, start: float) -> Payment | None:
+def _earned(proof: Proof, need: Need, surface: Surface, start: float, ceiling: float = -math.inf) -> Payment | None:
+    """``ceiling`` bounds V from above where paths end before T without having failed."""
     if np.any(proof.ranges.high > 0):
         return None
     patched = patched_of(proof, -proof.ranges.residual_low, need, surface.steps)
-    return pay_lower(patched, start, float(surface.range_at(-1)[1].max()))
+    return pay_lower(patched, start, max(ceiling, float(surface.range_at(-1)[1].max())))
 
 
 def chart_below(

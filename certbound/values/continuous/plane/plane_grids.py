@@ -19,6 +19,7 @@ Sides = tuple[bool, bool]
 
 _THINNEST = 0.2
 _SPARSE = 6.0  # how fast cells grow outside of where simulated paths go, in units of its extent
+_FADING = 0.15  # of the box: how far from a face that is no limit the others lead in fewer
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -35,12 +36,24 @@ class Plane:
     nodes: tuple[Array, Array] | None = None
     held: tuple[Sides, Sides] = ((False, False), (False, False))  # faces that no path crosses
     visited: tuple[Pair, Pair] | None = None  # where simulated paths go, along each axis: cells are larger elsewhere
+    cut: tuple[Sides, Sides] = ((False, False), (False, False))  # faces that are no limits: who leaves has not failed
 
     def across(self, axis: int, place: list[Array], t: float) -> Array:
         """a's entry across a face, not below a small share of its largest value where it may vanish."""
         a = self.square(t, *place)[axis, axis] * np.ones(np.broadcast_shapes(*(np.shape(one) for one in place)))
         least = _THINNEST * float(np.max(a)) if any(itertools.chain(*self.held)) else 0.0
         return np.asarray(np.maximum(a, max(least, 1e-300)))
+
+    def counted(self, x: Array, y: Array) -> Array:
+        """1, and 0 at faces at which the box is only cut; smooth between, with no slope at its ends."""
+        share = np.ones(np.broadcast_shapes(x.shape, y.shape))
+        for axis, place in enumerate((x, y)):
+            width = _FADING * (self.high[axis] - self.low[axis])
+            for side, away in ((0, place - self.low[axis]), (1, self.high[axis] - place)):
+                if self.cut[axis][side]:
+                    s = np.clip(away / width - 1e-9, 0.0, 1.0)
+                    share = share * s**3 * (10 - 15 * s + 6 * s * s)
+        return share
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

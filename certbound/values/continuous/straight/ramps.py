@@ -9,6 +9,9 @@ along the face like the process whose motion across the face is left out; in a c
 1 - U in a corner is the product of what it is along both faces, and the equation holds there too. Where more is needed
 in a corner (noises that go together), the source does it, which acts on faces as it does inside.
 
+Faces that are no limits, at which the box is only cut: lower bounds have U = 0 there, and ramps that weaken towards
+them along the others; for upper bounds they are limits.
+
 Lower bounds take U as it is. For upper bounds the ramp is over before T: U starts `SHIFT` ramps earlier, and is divided
 by its least value on the faces.
 """
@@ -36,6 +39,8 @@ _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
 _LONGEST = 8  # steps of the horizon, at least
 
+_ZONE = 6  # cells at a face where the drift back is weakened
+
 _R = 6**0.5
 _STAGES = np.array([(4 - _R) / 10, (4 + _R) / 10, 1.0])
 _INVERSE = np.linalg.inv([
@@ -57,7 +62,7 @@ class Ramps:
     ``plane`` must not depend on time and have one branch.
     """
 
-    def __init__(self, plane: Plane, cells: int, lead: float) -> None:
+    def __init__(self, plane: Plane, cells: int, lead: float, *, eased: bool = False, below: bool = False) -> None:
         self.plane, self.lead = plane, lead
         nodes = [spread_nodes(plane, Plan(cells=cells, growth=_GROWTH, lead=lead), axis) for axis in (0, 1)]
         self.nodes, self.splines = nodes, [Splines(one) for one in nodes]
@@ -65,6 +70,9 @@ class Ramps:
         (force,), a = plane.drift(0.0, x, y), plane.square(0.0, x, y) * np.ones((2, 2, *x.shape))
         on = np.zeros((2, *x.shape))  # faces across the first and across the second axis
         on[0, [0, -1]] = on[1, :, [0, -1]] = 1
+        led = plane.counted(x, y)
+        if eased:
+            force, led = self._eased(force, a, led, x, y, below)
         own = [[csr_matrix(table) for table in one.dense] for one in self.splines]
 
         def part(weight: Array, i: int, j: int) -> csr_matrix:
@@ -74,9 +82,35 @@ class Ramps:
         self.operator = part((1 - on[0]) * force[0], 1, 0) + part((1 - on[1]) * force[1], 0, 1)
         self.operator += part((1 - on[0]) * a[0, 0] / 2, 2, 0) + part((1 - on[1]) * a[1, 1] / 2, 0, 2)
         self.operator += part((1 - on[0]) * (1 - on[1]) * a[0, 1], 1, 1)
-        self.count = on.sum(axis=0).ravel()
-        self.edge, self.inner = np.flatnonzero(self.count), np.flatnonzero(self.count == 0)
+        met = on.sum(axis=0).ravel()
+        self.count = met * led.ravel()
+        self.edge, self.inner = np.flatnonzero(self.count), np.flatnonzero(met == 0)
+        self.gone = np.flatnonzero((met > 0) & (self.count == 0))  # on faces that are no limits: U = 0
         self.factors: dict[float, tuple[object, object]] = {}
+
+    def _eased(self, force: Array, a: Array, led: Array, x: Array, y: Array, below: bool) -> tuple[Array, Array]:
+        """The drift and what faces count where the drift leads back into the box faster than cells can follow.
+
+        Above, that drift is weakened near faces: U rises towards them, so that the residual falls. Below, such faces
+        have U = 0, and it is weakened there too: U falls towards them, so that the residual rises.
+        """
+        force, place = force * np.ones((2, *x.shape)), (x, y)
+        weak, counted = force.copy(), led.copy()
+        for axis, side in itertools.product((0, 1), (0, 1)):
+            nodes = self.nodes[axis] if side == 0 else self.nodes[axis][::-1]
+            zone, away, sign = abs(nodes[_ZONE] - nodes[0]), np.abs(place[axis] - nodes[0]), 1 - 2 * side
+            most = a[axis, axis] * _ZONE / zone
+            near = np.clip(2 - 2 * away / zone, 0.0, 1.0)
+            near = near * near * (3 - 2 * near)
+            if below:
+                edge = np.take(sign * force[axis] / most, [-side], axis=axis)
+                slow = np.clip(2 - edge, 0.0, 1.0) * np.ones(x.shape)
+                slow = slow * slow * (3 - 2 * slow)
+                own = np.moveaxis(counted, axis, 0)
+                own[-side] *= np.moveaxis(slow, axis, 0)[-side]
+                near = near * (1 - np.take(counted, [-side], axis=axis))
+            weak[axis] -= sign * near * np.maximum(sign * force[axis] - most, 0.0)
+        return weak, counted
 
     def surface(self, source: Source | None, *, below: bool) -> Surface:
         """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
@@ -112,6 +146,7 @@ class Ramps:
         system = kron(csr_matrix(_INVERSE / step), own) - kron(eye(3), moved) + decay
         gained = right[:, edge] + np.outer(fall, self.count[edge])
         right[:, edge] = splu(csc_matrix(system)).solve(gained.ravel()).reshape(3, -1)
+        right[:, self.gone] = 0.0
         if step not in self.factors:
             self.factors[step] = self._factor(_ROOTS[_REAL].real / step), self._factor(_ROOTS[_PAIR] / step)
         real, pair = self.factors[step]
@@ -121,10 +156,11 @@ class Ramps:
         return np.asarray(parts.real)
 
     def _factor(self, root: complex) -> object:
+        outer = np.concatenate([self.edge, self.gone])
         whole = vstack([
-            (root * self.mass - self.operator)[self.inner], eye(len(self.count), format="csr")[self.edge]
+            (root * self.mass - self.operator)[self.inner], eye(len(self.count), format="csr")[outer]
         ], format="csr")  # fmt: skip
-        order = np.argsort(np.concatenate([self.inner, self.edge]))
+        order = np.argsort(np.concatenate([self.inner, outer]))
         return splu(csc_matrix(whole[order]))
 
     def _written(self, times: Array, values: list[Array], rates: list[Array], below: bool) -> Surface:
