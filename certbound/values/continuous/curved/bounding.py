@@ -62,8 +62,8 @@ _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 def bound_region(problem: Problem, model: Model, deadline: float, wanted: float, between: Between) -> Found:
     """The upper bound on one grid after another; both in a box, the lower one where that is above ``wanted``.
 
-    In a box ``between`` (`straight.bound_between`) is asked first. Nothing
-    is proposed for certificates, which know no curved limits, and boxes with all of their sides.
+    In a box ``between`` (`straight.bound_between`) is asked first. Nothing is proposed for certificates, which know
+    no curved limits, and boxes with all of their sides.
     """
     plain = model
     plane, region, level, model = _setting(problem, model)
