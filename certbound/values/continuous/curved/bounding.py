@@ -62,14 +62,13 @@ _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 def bound_region(problem: Problem, model: Model, deadline: float, wanted: float, between: Between) -> Found:
     """The upper bound on one grid after another; both in a box, the lower one where that is above ``wanted``.
 
-    In a box ``between`` (`straight.bound_between`) is asked first. Nothing is proposed for certificates, which know
-    no curved limits, and boxes with all of their sides.
+    In a box ``between`` (`straight.bound_between`) is asked first. Certificates know no curved limits.
     """
     plain = model
     plane, region, level, model = _setting(problem, model)
     if not region.walls.groups:
-        upper, lower, words, _ = _in_box(problem, plain, model, (plane, level), deadline, wanted, between)
-        return upper, lower, words.replace("two states", "two states on a box that few paths leave"), ([], [])
+        upper, lower, words, stated = _in_box(problem, plain, model, (plane, level), deadline, wanted, between)
+        return upper, lower, words.replace("two states", "two states on a box that few paths leave"), stated
     patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     upper, done = 0.0, []
     for share in _SHARES:
