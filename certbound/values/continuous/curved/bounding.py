@@ -105,7 +105,8 @@ def _in_box(
 
     if held:
         return by_logs(deadline, wanted)
-    return between(problem, model, plane, outer, deadline, wanted, by_logs)
+    inner = plane if outer is None else replace(plane, cut=outer.cut)
+    return between(problem, model, inner, outer, deadline, wanted, by_logs)
 
 
 def _outer(problem: Problem, model: Model, plane: Plane) -> Plane | None:

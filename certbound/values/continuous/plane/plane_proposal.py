@@ -39,7 +39,7 @@ class SolverBelow(Solver):
         ]
         drawn = np.minimum(shares[0] ** 2 + shares[1] ** 2, 1.0)
         self.drawn = -_DRAWN * plan.floor / plan.lead * drawn
-        self.counted = plane.counted(*np.broadcast_arrays(self.x, self.y))
+        self.counted, _ = plane.counted(self.x, self.y)
 
     def grid(self, axis: int) -> Array:
         nodes = spread_nodes(self.plane, self.plan, axis)

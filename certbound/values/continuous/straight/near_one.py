@@ -47,6 +47,7 @@ _LEAD = 6.0  # over cells^2: a ramp's share of the horizon
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
+_WORSE = 1.5  # times the least one of those before: sources do not help any more
 _CLOSE = 0.05  # of log P between both bounds: no finer grid
 _LIKELY = 0.15  # of log P: as near to a rough guess nothing is wrong
 _ENOUGH = 0.25  # and nothing else is tried
@@ -122,17 +123,17 @@ def _bounded(
     plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool
 ) -> Proposed | None:
     """The best bound of a few proposals: corrected by samples of the residual, then by its bounds."""
-    starts, kinds = plane.starts, list[tuple[float, Ramps, Surface, Source | None]]()
+    starts, kinds = plane.starts, list[tuple[float, float, Ramps, Surface, Source | None]]()
     for eased in (False, True):
         solver = Ramps(plane, cells, min(_LEAD / cells**2, 0.1) * plane.horizon, eased=eased, below=below)
-        surface, source, value = _corrected(solver, model, points, below)
+        surface, source, value, promised = _corrected(solver, model, points, below)
         if surface is not None and 0 < value < 1:
-            kinds.append((value, solver, surface, source))
-            if abs(math.log(value) - level) < _LIKELY:
+            kinds.append((promised, value, solver, surface, source))
+            if promised > 0 and abs(math.log(promised) - level) < _LIKELY:
                 break
     if not kinds:
         return None
-    value, solver, surface, source = (max if below else min)(kinds, key=lambda one: one[0])
+    _, value, solver, surface, source = (max if below else min)(kinds, key=lambda one: one[0])
     best: Proposed | None = None
     for factor in (*_AGAIN, None):
         spare = NEGLIGIBLE * SMALL * value
@@ -159,23 +160,29 @@ def _bounded(
 
 def _corrected(
     solver: Ramps, model: Model, points: Array | None, below: bool
-) -> tuple[Surface | None, Source | None, float]:
-    """The last proposal, its source, and about its bound."""
-    plane, source, value = solver.plane, None, 0.0
+) -> tuple[Surface | None, Source | None, float, float]:
+    """The proposal that promises most, its source, U at the starts and about the bound."""
+    plane, source = solver.plane, None
+    best: tuple[Surface | None, Source | None, float, float] = None, None, 0.0, math.inf
+    sign, least = -1 if below else 1, math.inf
     for factor in (*_FACTORS, None):
         surface = solver.surface(source, below=below)
         if not covers(surface, plane.horizon, plane.low, plane.high, within=not below):
             break
         value = 1 + extreme_over(surface, plane.starts, upper=not below, points=points) / SMALL
-        excess, _ = sampled_residual(surface, model, upper=not below, along=6)
-        needed = np.maximum(excess, 0.0) / SMALL
+        excess, level = sampled_residual(surface, model, upper=not below, along=6)
+        asked = level > -SMALL if below else level < 0  # where 0 < U < 1
+        needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / SMALL
         paid = float(needed.max(axis=(1, 2)) @ surface.steps)
         if not math.isfinite(paid) or value <= 0:
             break
-        if factor is None or paid < 2 * _LEFT * value:
-            return surface, source, value
+        if best[0] is None or sign * (value - best[3]) + paid < 0:
+            best = surface, source, value, value + sign * paid
+        if factor is None or paid < 2 * _LEFT * value or paid > _WORSE * least:
+            break
+        least = min(least, paid)
         source = _more(source, surface, factor * needed)
-    return None, None, value
+    return best
 
 
 def _more(source: Source | None, surface: Surface, needed: Array) -> Source:

@@ -9,8 +9,12 @@ along the face like the process whose motion across the face is left out; in a c
 1 - U in a corner is the product of what it is along both faces, and the equation holds there too. Where more is needed
 in a corner (noises that go together), the source does it, which acts on faces as it does inside.
 
-Faces that are no limits, at which the box is only cut: lower bounds have U = 0 there, and ramps that weaken towards
-them along the others; for upper bounds they are limits.
+*Given up* (`Plane.counted`) are faces at which the box is only cut, and corners where both noises go together closely,
+in which U bends more than any spline. U = -d there for lower bounds, 1 + d for upper ones: below 0, and above 1,
+nothing is asked of it. Ramps of lower bounds weaken towards these places.
+
+*Eased*: U is drawn to that on the way (U_tau = ... - k (U + d) leaves a residual of the right sign), and the drift is
+weakened at faces from which it leads back faster than cells can follow.
 
 Lower bounds take U as it is. For upper bounds the ramp is over before T: U starts `SHIFT` ramps earlier, and is divided
 by its least value on the faces.
@@ -39,6 +43,7 @@ _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
 _LONGEST = 8  # steps of the horizon, at least
 
+_PAST = 0.05  # d: how far beyond 0 and 1 U is where it is given up
 _ZONE = 6  # cells at a face where the drift back is weakened
 
 _R = 6**0.5
@@ -70,7 +75,8 @@ class Ramps:
         (force,), a = plane.drift(0.0, x, y), plane.square(0.0, x, y) * np.ones((2, 2, *x.shape))
         on = np.zeros((2, *x.shape))  # faces across the first and across the second axis
         on[0, [0, -1]] = on[1, :, [0, -1]] = 1
-        led = plane.counted(x, y)
+        share, lost = plane.counted(x, y)
+        led = share if below else np.ones(x.shape)
         if eased:
             force, led = self._eased(force, a, led, x, y, below)
         own = [[csr_matrix(table) for table in one.dense] for one in self.splines]
@@ -83,9 +89,13 @@ class Ramps:
         self.operator += part((1 - on[0]) * a[0, 0] / 2, 2, 0) + part((1 - on[1]) * a[1, 1] / 2, 0, 2)
         self.operator += part((1 - on[0]) * (1 - on[1]) * a[0, 1], 1, 1)
         met = on.sum(axis=0).ravel()
-        self.count = met * led.ravel()
-        self.edge, self.inner = np.flatnonzero(self.count), np.flatnonzero(met == 0)
-        self.gone = np.flatnonzero((met > 0) & (self.count == 0))  # on faces that are no limits: U = 0
+        moves = ((met == 0) | (share.ravel() > 0)).astype(float)  # not on faces that are no limits
+        drawn, lost = -_PAST if below else 1 + _PAST, eased * moves * lost.ravel()
+        self.operator = csr_matrix(diags(moves) @ self.operator - diags(lost) @ self.mass)
+        self.count = met * led.ravel() * moves
+        self.edge, self.inner = np.flatnonzero(met), np.flatnonzero(met == 0)
+        self.moves, self.fed = moves, drawn * lost
+        self.first = splu(csc_matrix(self.mass)).solve(drawn * (1 - share.ravel()))
         self.factors: dict[float, tuple[object, object]] = {}
 
     def _eased(self, force: Array, a: Array, led: Array, x: Array, y: Array, below: bool) -> tuple[Array, Array]:
@@ -118,15 +128,16 @@ class Ramps:
         times, first = _times(horizon, shift, self.lead)
         sign = -1.0 if below else 1.0
         given = None if source is None else sign * source.at([one.points for one in self.splines])
-        value, rate = np.zeros(len(self.count)), np.zeros(len(self.count))
+        value = self.first
+        rate = splu(csc_matrix(self.mass)).solve(self.operator @ value + self.fed)
         values, rates = [value], [rate]
         for start, end in itertools.pairwise(times):
             poll("a proposal of the value function")
             step = end - start
             stages = [shift + horizon - (start + c * step) for c in _STAGES]
-            fed = np.zeros((3, len(value)))
+            fed = np.zeros((3, len(value))) + self.fed
             if source is not None and given is not None:
-                fed = np.stack([_at(source.times, given, t) for t in stages])
+                fed += self.moves * np.stack([_at(source.times, given, t) for t in stages])
             ages = start + _STAGES * step
             found = self._step(value, step, fed, ages)
             rate = _END_RATE @ np.vstack([value, found]) / step
@@ -146,7 +157,6 @@ class Ramps:
         system = kron(csr_matrix(_INVERSE / step), own) - kron(eye(3), moved) + decay
         gained = right[:, edge] + np.outer(fall, self.count[edge])
         right[:, edge] = splu(csc_matrix(system)).solve(gained.ravel()).reshape(3, -1)
-        right[:, self.gone] = 0.0
         if step not in self.factors:
             self.factors[step] = self._factor(_ROOTS[_REAL].real / step), self._factor(_ROOTS[_PAIR] / step)
         real, pair = self.factors[step]
@@ -156,11 +166,10 @@ class Ramps:
         return np.asarray(parts.real)
 
     def _factor(self, root: complex) -> object:
-        outer = np.concatenate([self.edge, self.gone])
         whole = vstack([
-            (root * self.mass - self.operator)[self.inner], eye(len(self.count), format="csr")[outer]
+            (root * self.mass - self.operator)[self.inner], eye(len(self.count), format="csr")[self.edge]
         ], format="csr")  # fmt: skip
-        order = np.argsort(np.concatenate([self.inner, outer]))
+        order = np.argsort(np.concatenate([self.inner, self.edge]))
         return splu(csc_matrix(whole[order]))
 
     def _written(self, times: Array, values: list[Array], rates: list[Array], below: bool) -> Surface:
