@@ -48,6 +48,7 @@ _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
 _WORSE = 1.5  # times the least one of those before: sources do not help any more
+_MUCH = 10.0  # times U at the starts: where a proof would pay more, another pass does not make it good
 _CLOSE = 0.05  # of log P between both bounds: no finer grid
 _LIKELY = 0.15  # of log P: as near to a rough guess nothing is wrong
 _ENOUGH = 0.25  # and nothing else is tried
@@ -127,7 +128,7 @@ def _bounded(
     for eased in (False, True):
         solver = Ramps(plane, cells, min(_LEAD / cells**2, 0.1) * plane.horizon, eased=eased, below=below)
         surface, source, value, promised = _corrected(solver, model, points, below)
-        if surface is not None and 0 < value < 1:
+        if surface is not None and 0 < value < 1 and abs(promised - value) < _MUCH * value:
             kinds.append((promised, value, solver, surface, source))
             if promised > 0 and abs(math.log(promised) - level) < _LIKELY:
                 break
