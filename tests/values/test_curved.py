@@ -288,7 +288,7 @@ def test_a_certificate_that_cannot_state_a_curved_set_is_refused(monkeypatch: py
     problem = in_disc(horizon=0.5, noise=0.3)
     assert walled(problem)
     assert not walled(problem.replace(safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))]))
-    monkeypatch.setattr(exits, "bound_region", lambda *rest: (-3.0, None, "as proved elsewhere", []))
+    monkeypatch.setattr(exits, "bound_region", lambda *rest: (-3.0, None, "as proved elsewhere", ([], [])))
     answer = values_engine(problem)
     assert answer.applicable
     assert answer.log10_delta < -1.2

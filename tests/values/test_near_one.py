@@ -12,6 +12,7 @@ import pytest
 import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.values.continuous import exits, straight
+from certbound.values.continuous.curved import bounding
 from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import Model, prove_lower, prove_upper
 from certbound.values.continuous.plane import Plane, plane_of
@@ -36,8 +37,8 @@ def test_both_bounds_are_near_the_truth_and_hold_on_spoilt_proposals() -> None:
     stays = 4 / np.pi * float(np.sum((-1.0) ** np.arange(30) / odd * np.exp(-((0.6 * np.pi * odd) ** 2) / 8)))
     truth = math.log(1 - stays**2)
     inner, model = plane(free())
-    above = near_one._bounded(inner, model, 10, None, below=False)
-    below = near_one._bounded(inner, model, 10, None, below=True)
+    above = near_one._bounded(inner, model, 10, truth, None, below=False)
+    below = near_one._bounded(inner, model, 10, truth, None, below=True)
     assert above is not None
     assert below is not None
     assert truth - 0.5 < below[1].log <= truth <= above[1].log < truth + 0.4
@@ -57,8 +58,8 @@ def test_noises_that_go_together_have_both_bounds() -> None:
     system = cb.ContinuousSystem(lambda x: [0 * x[0], 0 * x[1]], states=2, diffusion=gain)
     problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
     inner, model = plane(problem)
-    above = near_one._bounded(inner, model, 12, None, below=False)
-    below = near_one._bounded(inner, model, 12, None, below=True)
+    above = near_one._bounded(inner, model, 12, math.log(0.3), None, below=False)
+    below = near_one._bounded(inner, model, 12, math.log(0.3), None, below=True)
     assert above is not None
     assert below is not None
     odd = 2 * np.arange(30) + 1.0
@@ -103,3 +104,34 @@ def test_where_it_does_not_serve_the_logarithm_is_proposed(monkeypatch: pytest.M
             problem, exits._model(problem), safe_room(problem), time.perf_counter() + seconds, -math.inf
         )
         assert str(found) == "the logarithm"
+
+
+def test_a_side_that_is_no_limit_does_not_count_below() -> None:
+    cut = ((True, False), (True, False))
+    kept = [cb.Inside(cb.HalfSpace([1, 0], 1)), cb.Inside(cb.HalfSpace([0, 1], 1))]
+    truth = math.log(1 - math.erf(1 / (0.6 * math.sqrt(2))) ** 2)
+    problem = free().replace(safe=kept)
+    model = exits._model(problem)
+    inner = plane_of(problem, model, (-1.5, -1.5), (1.0, 1.0), starts_of(problem))
+    outer = bounding._outer(problem, model, inner)
+    assert outer is not None
+    assert outer.cut == cut
+    below = near_one._bounded(outer, model, 10, truth, None, below=True)
+    assert below is not None
+    assert truth - 1.0 < below[1].log <= truth
+    # a narrow box: where all of its sides counted, more would be proved than is true
+    narrow = dataclasses.replace(outer, low=(-0.4, -0.4))
+    wrong = near_one._bounded(dataclasses.replace(inner, low=(-0.4, -0.4)), model, 8, truth, None, below=True)
+    assert wrong is not None
+    assert wrong[1].log > truth
+    payment = prove_lower(wrong[0], model, narrow.starts, cut=cut)
+    assert payment is None or payment.log <= truth
+
+
+def test_where_the_drift_leads_back_fast_few_cells_do() -> None:
+    system = cb.ContinuousSystem(lambda x: [1.5 - x[0], 3 - 3 * x[1]], states=2, diffusion=0.3 * np.eye(2))
+    problem = cb.Problem(system, initial=[1, 1], safe=[cb.Inside(cb.Box([-2, 0], [1.8, 2]))], horizon=2)
+    found = [ramps.Ramps(plane(problem)[0], 14, 0.05, eased=one).surface(None, below=False) for one in (False, True)]
+    lows = [float(one.range_at(0)[0].min()) / ramps.SMALL + 1 for one in found]
+    assert lows[0] < -0.1  # it rings
+    assert lows[1] > -0.02

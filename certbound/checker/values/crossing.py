@@ -3,8 +3,8 @@
 On a box of states, some of whose sides break a constraint, with R and Q2 as in `passage`:
 
 - V <= 0 on the box at all times (what it exceeds is taken off everywhere);
-- R >= -lam_k - eps_k exp(v0 - V) - m(V) Q2 in slab k, for one value of the disturbance on every patch, v0 being at most
-  V(0, .) at one of the stated starts;
+- R >= -lam_k - eps_k exp(v0 - V) - m(V) Q2 in slab k, for one value of the disturbance on every patch where
+  exp(V) > W somewhere, v0 being at most V(0, .) at one of the stated starts;
 - m is a step function of the level, q is continuous and linear on every step, q = 0 below the lowest one, q >= 0, and
   q' >= (1 + q)(m - q).
 
@@ -14,9 +14,10 @@ of lam,
 
     P + (1 - P) W >= exp(theta(v0) - M L) - M exp(v0) sum_k eps_k h_k
 
-for the probability P of reaching such a side within T, W being at least exp(V) at T, and on the other sides. The
-disturbance is a feedback, piecewise constant in time and state: where it takes more than one value the noise is shown
-to have full rank, so that the equation with it has a (weak) solution.
+for the probability P of reaching such a side within T, W being at least exp(V) at T, and on the other sides: the
+process is stopped there, and where exp(V) <= W. The disturbance is a feedback, piecewise constant in time and state:
+where it takes more than one value the noise is shown to have full rank, so that the equation with it has a (weak)
+solution.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ class Crossing(Passage):
     """The proof's numbers, and what follows from them for the lower bound."""
 
     upper_side = False
+    stopped = -np.inf
 
     def lower(self) -> arb:
         """At most the probability of leaving from one of the stated starts, or from a random one."""
@@ -54,6 +56,9 @@ class Crossing(Passage):
 
     def crossed(self, stages: Sequence[Crossing]) -> arb:
         """The same over stages that follow each other, this one being the first; all are lowered."""
+        ceiling = max(stage.ceiling() for stage in stages)
+        for stage in stages:
+            stage.stopped = ceiling
         start = self._level()
         slabs = [paid for stage in stages for paid in stage.paid(start)]
         lam, rest = (sum(parts, arb(0)) for parts in zip(*slabs))
@@ -63,7 +68,6 @@ class Crossing(Passage):
             found = self._mean(lambda low, _: (arb(low) - growth - most * lam).exp(), self._certain)
         else:
             found = (arb(start) - self.levels.above(arb(start)) - most * lam).exp()
-        ceiling = max(stage.ceiling() for stage in stages)
         if not ceiling < 0:
             return arb(0)
         kept = arb(ceiling).exp()
@@ -149,7 +153,8 @@ class Crossing(Passage):
             best = np.where(has_full_rank(squares), best, -np.inf)
         reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
         need = (-best - eps * reach * (1 - 1e-12)) * (1 + 1e-12)
-        return np.where(np.isfinite(best), np.maximum(need, 0.0), np.inf)
+        need = np.where(np.isfinite(best), np.maximum(need, 0.0), np.inf)
+        return np.where(high <= self.stopped, 0.0, need)
 
 
 def _most(values: Array) -> float:

@@ -149,8 +149,11 @@ def bound_exits(
         _refuse_random(problem)
         upper, least, words, (proposed, below) = bound_windows(problem, model, begin + seconds)
     elif walled(problem) and not (boxed(problem) and led(model)):
+        from certbound.values.continuous.straight import bound_between
+
         _refuse_random(problem)
-        upper, least, words, proposed = bound_region(problem, model, begin + seconds)
+        wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
+        upper, least, words, (proposed, below) = bound_region(problem, model, begin + seconds, wanted, bound_between)
     else:
         from certbound.values.continuous.straight import bound_plane
 

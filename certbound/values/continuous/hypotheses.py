@@ -90,11 +90,12 @@ class Proof:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Need:
-    """Which patches need no close look: V >= ``top`` throughout, or |R| paid for by ``spare`` (1 + exp(start - V))."""
+    """Which patches need no close look: V >= ``top`` or V <= ``bottom``, or |R| <= ``spare`` (1 + exp(start - V))."""
 
     spare: float
     start: float
     top: float
+    bottom: float = -np.inf
 
     def free(self, high: Array) -> Array:
         """The excess that is paid for in any case where V <= ``high``."""
@@ -122,7 +123,7 @@ def examine(
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
         low, high = value_range(patches)
         size = coarse_size(patches, drifts, squares, place)
-        due = ~(low >= need.top) & ~(size <= need.free(high))  # what is no number is looked at
+        due = ~(low >= need.top) & ~(high <= need.bottom) & ~(size <= need.free(high))  # no number is looked at, too
         kept = np.flatnonzero(due & ~np.tile(over, ends[1] - ends[0]))
         if not len(kept):
             return None
@@ -163,9 +164,7 @@ def sampled_residual(
     return excess, low if upper else high
 
 
-def sampled(
-    surface: Surface, model: Model, *, upper: bool = True, along: int = 5
-) -> tuple[Array, Array, Array]:
+def sampled(surface: Surface, model: Model, *, upper: bool = True, along: int = 5) -> tuple[Array, Array, Array]:
     """The same in two or three states, with V's least and largest values."""
     counts, sample = ((4, along, along), sample_in_plane) if len(surface.axes) == 2 else ((4, 7, 7, 7), sample_in_space)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
@@ -178,8 +177,7 @@ def sampled(
         return sample(patches, drifts, squares, place, counts, upper=upper), *value_range(patches)
 
     found = side_by_side(look, list(surface.chunks()))
-    shape = (surface.slabs, *surface.cells)
-    excess, low, high = (np.concatenate(parts).reshape(shape) for parts in zip(*found))
+    excess, low, high = (np.concatenate(parts).reshape(surface.slabs, *surface.cells) for parts in zip(*found))
     return excess, low, high
 
 
@@ -280,48 +278,51 @@ def chart_above(
     paid = [cheapest(proof, need, surface, level) for level in levels]
     charts = []
     for time, k, axes, values in surface.readings(slabs, near, up=True):
-        rows = [bound_above(one.terms, _above(values, lift), k) for one, lift in paid if one.terms is not None]
+        raised = [(one.terms, values + lift + 1e-15 * (np.abs(values) + lift)) for one, lift in paid]
+        rows = [bound_above(terms, above, k) for terms, above in raised if terms is not None]
         best = np.minimum.reduce([np.zeros(values.shape), *rows])
         charts.append(Chart(time=time, axes=axes, log10=from_natural(best, up=True)))
     return charts
 
 
-def _above(values: Array, lift: float) -> Array:
-    return np.asarray(values + lift + 1e-15 * (np.abs(values) + lift))
-
-
 def prove_lower(
-    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None
+    surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
+    cut: Sequence[Sides] = (),
 ) -> Payment | None:
-    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is."""
+    """A lower bound of log P(leaving the box of the surface by its last time) from the best start, whatever it is.
+
+    Leaving by a face that is no limit (``cut``) does not count; nothing is asked where V <= what is taken off there.
+    """
     if extreme_over(surface, starts, upper=False, points=points) == -math.inf:
         return None
-    return proved_lower(surface, model, starts, points)[0]
+    return proved_lower(surface, model, starts, points, cut=cut)[0]
 
 
 def proved_lower(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
-    negligible: float = NEGLIGIBLE,
+    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (),
 ) -> tuple[Payment | None, Proof]:
     """The same with what was seen, where some start lies in the grid; ``negligible`` stands for `NEGLIGIBLE`."""
     surface = _sunk(surface)
     start = -up(-extreme_over(surface, starts, upper=False, points=points))
-    need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf)
+    ends = [surface.face_range(axis, side)[1] for axis, sides in enumerate(cut) for side in (0, 1) if sides[side]]
+    end = max(float(surface.range_at(-1)[1].max()), *ends, -math.inf)
+    need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf, bottom=end)
     proof = examine(surface, model, need, upper=False)
-    return _earned(proof, need, surface, start), proof
+    return _earned(proof, need, surface, start, end), proof
 
 
 def _sunk(surface: Surface) -> Surface:
     """The surface, lowered until V <= 0 everywhere."""
-    highest = top_of(surface)
-    return surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface
+    return surface.raised(-highest - 1e-12 * (1 + highest)) if (highest := top_of(surface)) > 0 else surface
 
 
-def _earned(proof: Proof, need: Need, surface: Surface, start: float) -> Payment | None:
+def _earned(proof: Proof, need: Need, surface: Surface, start: float, end: float) -> Payment | None:
+    """``end`` bounds V from above where paths end without having failed."""
     if np.any(proof.ranges.high > 0):
         return None
     patched = patched_of(proof, -proof.ranges.residual_low, need, surface.steps)
-    return pay_lower(patched, start, float(surface.range_at(-1)[1].max()))
+    return pay_lower(patched, start, end)
 
 
 def chart_below(
@@ -331,7 +332,7 @@ def chart_below(
     surface = _sunk(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=np.inf)
     proof = examine(surface, model, need, upper=False)
-    found = [_earned(proof, need, surface, level) for level in levels]
+    found = [_earned(proof, need, surface, level, float(surface.range_at(-1)[1].max())) for level in levels]
     paid = [payment.terms for payment in found if payment is not None and payment.terms is not None]
     charts = []
     for time, k, axes, values in surface.readings(slabs, near, up=False):

@@ -25,7 +25,7 @@ from certbound.checker.statement import read_model, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values import check_values_below, quadratic, walls
 from certbound.checker.values.batch_tapes import run
-from certbound.checker.values.crossing import has_full_rank
+from certbound.checker.values.crossing import Crossing, has_full_rank
 from certbound.checker.values.hermite import Levels, Surface
 from certbound.checker.values.normal_means import ORDER, axis_table, mean_table
 from certbound.checker.values.passage import Passage
@@ -325,6 +325,26 @@ def test_what_v_is_at_the_end_and_on_harmless_sides_is_taken_off_from_below() ->
     assert flat_below(-1.0, high=3.0) == 0
     falling = flat_below(-1.0, high=1.5, end=-3.0)  # V_t is -4 in the mean, at most 6 in size: lam pays for it
     assert falling == 0 or falling < math.exp(-1.0)
+
+
+def test_the_residual_is_paid_for_from_below_unless_v_is_at_most_what_is_taken_off() -> None:
+    """V falls from -1 at x = -1 to -3 at x = -2, bent by up to 11.5: R is about -.9 there, with x' = .4 dW."""
+    system = cb.ContinuousSystem(lambda x: 0 * x, states=1, diffusion=0.4)
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-2], [1]))], horizon=0.5, delta=0.5)
+    values = np.zeros((2, 4, 3))
+    values[:, :, 0] = [-3.0, -1.0, -1.0, -1.0]
+    proof = {
+        "engine": "values", "axes": [exact([-2.0, -1.0, 0.0, 1.01])], "times": exact([0.0, 0.5]),
+        "values": packed(values), "rates": packed(np.zeros((2, 4, 3))), "edges": exact([0.0]), "m": [],
+        "q": exact([0.0]), "lam": exact([0.0]), "eps": exact([0.0]), "side": "lower", "starts": exact([[0.0]]),
+    }  # fmt: skip
+    model = read_model(json.loads(json.dumps(problem_data(problem))), Budget(60.0))
+    crossing = Crossing(model, json.loads(json.dumps(proof)), Budget(60.0))
+    crossing.lift, paid = 0.0, []
+    for crossing.stopped in (-np.inf, -1.001, -0.999):
+        paid.append(float(crossing._payments(-1.0).max()))
+    assert paid[0] == paid[1] > 0.5
+    assert paid[2] == 0
 
 
 def test_feedback_disturbances_need_noise_ofhas_full_rank() -> None:

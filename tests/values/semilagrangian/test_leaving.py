@@ -373,7 +373,8 @@ def test_whoever_met_a_face_counts_once_in_the_mean_on_whichever_line_it_ends() 
     rates, factors = np.full((2, 4), np.nan), np.ones((2, 4))
     for k in (0, 1):
         rates[k, k], factors[k, k] = mirrors._paid((drifts[k], 0.0), 1.0, 1.0, depths, (6.0, 0.15), blind=k == 1)
-    levels = np.array([0, 0, *(mirrors._levelled([(math.inf, 0.0), (drift, 0.0)], 1.0, 1.0)[1] for drift in drifts[2:])])[:, None]
+    always = [mirrors._levelled([(math.inf, 0.0), (drift, 0.0)], 1.0, 1.0)[1] for drift in drifts[2:]]
+    levels = np.array([0, 0, *always])[:, None]
     around = np.array([0, 0, 1, 2]), np.array([2, 3, 4, 4])  # paths come to a line and the next ones
     levels = mirrors._alike(np.arange(4), rates, factors, levels, around)
     found = levels + 0 * fine

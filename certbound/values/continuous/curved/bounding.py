@@ -9,7 +9,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,13 +22,14 @@ from certbound.values.continuous.curved.continuation import propose_within
 from certbound.values.continuous.curved.cuts import Cuts
 from certbound.values.continuous.curved.proof import Lot, highest_over, look_over, prove_within, raised_over_walls
 from certbound.values.continuous.curved.region import Region, region_of
+from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import LIFTS, Model, covers, extreme_over
-from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import (
+    Found,
     Plan,
     Plane,
     Source,
-    bound_plane_above,
+    bound_box,
     floats_of,
     held_plane,
     released,
@@ -36,7 +37,7 @@ from certbound.values.continuous.plane import (
     slab_times,
 )
 from certbound.values.continuous.residual import sample_in_plane, value_range
-from certbound.values.continuous.room import starts_of
+from certbound.values.continuous.room import limits_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -54,23 +55,21 @@ _STEEP = 1.0  # how far V falls at most over a cell at a wall, at the horizon
 _SAMPLES = (4, 5, 5)
 _RANK = 1e-9  # of the squared noise: a smaller share in some direction everywhere is none
 Squares = Callable[[float, Array, Array], Array]
+Between = Callable[[Problem, Model, Plane, Plane | None, float, float, Callable[[float, float], Found]], Found]
 _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 
 
-def bound_region(
-    problem: Problem, model: Model, deadline: float
-) -> tuple[float, None, str, list[tuple[Surface, Payment]]]:
-    """The upper bound on one grid after another; nothing is proposed for certificates, which know boxes only."""
-    plain, rare = model, -math.inf
+def bound_region(problem: Problem, model: Model, deadline: float, wanted: float, between: Between) -> Found:
+    """The upper bound on one grid after another; both in a box, the lower one where that is above ``wanted``.
+
+    In a box ``between`` (`straight.bound_between`) is asked first. Certificates know no curved limits.
+    """
+    plain = model
     plane, region, level, model = _setting(problem, model)
-    patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     if not region.walls.groups:
-        if any(itertools.chain(*plane.held)):
-            plane, written, rare = released(problem, plane, plain, level)
-            if written is not None:
-                model, level = written, rough_level(plane)
-        upper, done, _ = bound_plane_above(plane, model, level, patches, rare)
-        return upper, None, f"value function in two states on a box that few paths leave, cells: {', '.join(done)}", []
+        upper, lower, words, stated = _in_box(problem, plain, model, (plane, level), deadline, wanted, between)
+        return upper, lower, words.replace("two states", "two states on a box that few paths leave"), stated
+    patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
     upper, done = 0.0, []
     for share in _SHARES:
         plan = _plan(plane, level, share * patches)
@@ -83,7 +82,44 @@ def bound_region(
                 break
             raise
         done.append(f"{plan.cells}^2")
-    return upper, None, f"value function in two states within curved limits, cells: {', '.join(done)}", []
+    words = f"value function in two states within curved limits, cells: {', '.join(done)}"
+    return upper, None, words, ([], [])
+
+
+def _in_box(
+    problem: Problem, plain: Model, model: Model, rough: tuple[Plane, float], deadline: float, wanted: float,
+    between: Between,
+) -> Found:
+    """Both bounds where limits are missing, which the box has as faces that count above and do not count below."""
+    plane, level = rough
+    held, rare = any(itertools.chain(*plane.held)), -math.inf
+    if held:
+        plane, written, rare = released(problem, plane, plain, level)
+        if written is not None:
+            model, level = written, rough_level(plane)
+    outer = None if held or wanted == math.inf else _outer(problem, model, plane)
+
+    def by_logs(deadline: float, wanted: float) -> Found:
+        patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
+        return bound_box(problem, model, (plane, outer), (level, patches, rare), wanted)
+
+    if held:
+        return by_logs(deadline, wanted)
+    inner = plane if outer is None else replace(plane, cut=outer.cut)
+    return between(problem, model, inner, outer, deadline, wanted, by_logs)
+
+
+def _outer(problem: Problem, model: Model, plane: Plane) -> Plane | None:
+    """The box for lower bounds: a side is a limit, or the box is only cut there; None where noise vanishes."""
+    room = limits_of(problem)
+    cut = [(low > a, high < b) for low, high, a, b in zip(plane.low, plane.high, room.inner_low, room.inner_high)]
+    low = [here if own[0] else there for here, there, own in zip(plane.low, room.outer_low, cut)]
+    high = [here if own[1] else there for here, there, own in zip(plane.high, room.outer_high, cut)]
+    try:
+        check_noise(model, (0.0, plane.horizon), list(zip(low, high)))
+    except InfeasibleError:
+        return None
+    return replace(plane, low=(low[0], low[1]), high=(high[0], high[1]), cut=(cut[0], cut[1]))
 
 
 def _setting(problem: Problem, model: Model) -> tuple[Plane, Region, float, Model]:

@@ -73,7 +73,7 @@ def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) ->
             ends += own
         else:
             around = [np.maximum(around[0], own[0]), np.minimum(around[1], own[1])]
-    reach = reach_of(problem, drift, square, _BEYOND[near])
+    reach = reach_of(problem, drift, square, _BEYOND[near], (low, high))
     margin = _MARGIN * np.minimum(reach[1] - reach[0], around[1] - around[0])
     outer = [np.maximum(low, around[0] - margin), np.minimum(high, around[1] + margin)]
     far = [np.isinf(outer[0]) | near, np.isinf(outer[1]) | near]

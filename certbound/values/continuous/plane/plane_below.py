@@ -61,7 +61,7 @@ def bound_plane_below(
         source = more if source is None else source.plus(more)
     if best is None or best.estimate() < plan.floor:  # what is subtracted at last would leave nothing
         return None
-    payment = prove_lower(best.surface, model, starts, points)
+    payment = prove_lower(best.surface, model, starts, points, plane.cut)
     return None if payment is None else (best.surface, payment)
 
 

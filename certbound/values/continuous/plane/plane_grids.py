@@ -19,6 +19,8 @@ Sides = tuple[bool, bool]
 
 _THINNEST = 0.2
 _SPARSE = 6.0  # how fast cells grow outside of where simulated paths go, in units of its extent
+_TOGETHER = 0.35  # correlation of both noises at a corner, from which on it is given up
+_FADING = 0.2  # of the box: how far from a face that is no limit the others lead in fewer
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -35,12 +37,38 @@ class Plane:
     nodes: tuple[Array, Array] | None = None
     held: tuple[Sides, Sides] = ((False, False), (False, False))  # faces that no path crosses
     visited: tuple[Pair, Pair] | None = None  # where simulated paths go, along each axis: cells are larger elsewhere
+    cut: tuple[Sides, Sides] = ((False, False), (False, False))  # faces that are no limits: who leaves has not failed
 
     def across(self, axis: int, place: list[Array], t: float) -> Array:
         """a's entry across a face, not below a small share of its largest value where it may vanish."""
         a = self.square(t, *place)[axis, axis] * np.ones(np.broadcast_shapes(*(np.shape(one) for one in place)))
         least = _THINNEST * float(np.max(a)) if any(itertools.chain(*self.held)) else 0.0
         return np.asarray(np.maximum(a, max(least, 1e-300)))
+
+    def counted(self, x: Array, y: Array, most: float = 1.0) -> tuple[Array, Array]:
+        """1, and 0 where faces are given up; smooth between. And a rate at which paths cross that part.
+
+        Given up are faces at which the box is only cut, and corners where both noises go together closely, with a
+        correlation of at ``most`` that: U bends there more than any spline.
+        """
+        ends, a = (self.low, self.high), self.square(self.horizon, x, y) * np.ones((2, 2, *x.shape))
+        force = np.abs(self.drift(self.horizon, x, y)[0]) * np.ones((2, *x.shape))
+        share, lost, near, rate = np.ones(x.shape), np.zeros(x.shape), {}, {}
+        for axis, side in itertools.product((0, 1), (0, 1)):
+            width = _FADING * (self.high[axis] - self.low[axis])
+            s = np.clip(np.abs((x, y)[axis] - ends[side][axis]) / width - 1e-9, 0.0, 1.0)
+            near[axis, side] = 1 - s**3 * (10 - 15 * s + 6 * s * s)
+            rate[axis, side] = force[axis] / width + a[axis, axis] / width**2
+        parts: list[list[tuple[int, int]]] = [[one] for one in near if self.cut[one[0]][one[1]]]
+        for i, j in itertools.product((0, 1), (0, 1)):
+            linked = a[0, 1, -i, -j] ** 2 / (a[0, 0, -i, -j] * a[1, 1, -i, -j])
+            together = _TOGETHER**2 < linked <= most**2
+            parts += [[(0, i), (1, j)]] if together and not self.cut[0][i] and not self.cut[1][j] else []
+        for part in parts:
+            within = np.prod([near[one] for one in part], axis=0)
+            share = share * (1 - within)
+            lost = lost + within * max(float(rate[one].max(where=within > 0, initial=0.0)) for one in part)
+        return share, lost
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -39,6 +39,7 @@ class SolverBelow(Solver):
         ]
         drawn = np.minimum(shares[0] ** 2 + shares[1] ** 2, 1.0)
         self.drawn = -_DRAWN * plan.floor / plan.lead * drawn
+        self.counted, _ = plane.counted(self.x, self.y)
 
     def grid(self, axis: int) -> Array:
         nodes = spread_nodes(self.plane, self.plan, axis)
@@ -73,7 +74,11 @@ class SolverBelow(Solver):
         return top * (1 - rise), -top * 30 * (s * (1 - s)) ** 2 / self.plan.lead
 
     def _fed(self, tau: float, value: Array) -> Array:
-        return np.asarray(self.drawn * (self.face(tau)[0] - value) - self._source(tau))
+        return np.asarray(self.drawn * (self._drawn_to(tau) - value) - self._source(tau))
+
+    def _drawn_to(self, tau: float) -> Array:
+        """V on the faces, and what it is at T on those that are no limits."""
+        return np.asarray(self.plan.floor + self.counted * (self.face(tau)[0] - self.plan.floor))
 
     def _falls(self, tau: float, value: Array) -> Array:
         return np.asarray(self.drawn)

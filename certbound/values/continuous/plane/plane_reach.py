@@ -21,8 +21,11 @@ _ALONG = 65
 Floats = Callable[[float, Array, Array], Array]
 
 
-def reach_of(problem: Problem, drift: Floats, square: Floats, share: float) -> list[Array]:
-    """Ends of a box that hardly a path leaves, from simulated ones."""
+def reach_of(
+    problem: Problem, drift: Floats, square: Floats, share: float, limits: tuple[Array, Array] | None = None
+) -> list[Array]:
+    """Ends of a box that hardly a path leaves, from simulated ones, which end where they leave the ``limits``."""
+    low, high = (np.full(2, -np.inf), np.full(2, np.inf)) if limits is None else limits
     rng = np.random.default_rng(0)
     hull = problem.initial.hull()
     x = rng.uniform(hull.lo, hull.hi, (_PATHS, 2)).T
@@ -35,7 +38,8 @@ def reach_of(problem: Problem, drift: Floats, square: Floats, share: float) -> l
         root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
         noise = np.einsum("nij,nj->in", root, rng.standard_normal((_PATHS, 2)))
         moved = x + step * drift(t, *x)[0] + np.sqrt(step) * noise
-        x = np.where(np.isfinite(moved), moved, x)
+        inside = np.all((x >= low[:, None]) & (x <= high[:, None]), axis=0)
+        x = np.where(np.isfinite(moved) & inside, moved, x)
         least, most = np.minimum(least, x.min(axis=1)), np.maximum(most, x.max(axis=1))
     beyond = share * (most - least)
     return [least - beyond, most + beyond]
@@ -49,7 +53,7 @@ def closed_plane(problem: Problem, model: Model, room: Room) -> Room:
     if np.isfinite([*room.inner_low, *room.inner_high]).all():
         return room
     drift, square = floats_of(model)
-    reach = reach_of(problem, drift, square, _BEYOND)
+    reach = reach_of(problem, drift, square, _BEYOND, (np.array(room.inner_low), np.array(room.inner_high)))
     inner = [np.array(room.inner_low), np.array(room.inner_high)]
     infinite = [np.isinf(one) for one in inner]
     inner = [np.where(far, place, one) for far, place, one in zip(infinite, reach, inner)]

@@ -43,6 +43,7 @@ from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]
+Found = tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]
 Propose = Callable[[Plane, Plan, Source | None], Surface | None]
 
 _FACTOR = 1.12
@@ -72,7 +73,7 @@ BELOW = 0.6  # of as many patches again, for a lower bound
 
 def two_states(
     problem: Problem, model: Model, room: Room, deadline: float, wanted: float
-) -> tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]:
+) -> Found:
     """The upper bound on one grid after another, and the lower one where the upper one is above ``wanted``.
 
     The seconds until the deadline are turned into a number of patches, so that the bound does not depend on the clock.
@@ -95,14 +96,24 @@ def two_states(
         if wanted < math.inf:
             check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
-    level = rough_level(inner)
+    outer = None if held_anywhere(inner) else plane_of(problem, model, room.outer_low, room.outer_high, starts)
+    return bound_box(problem, model, (inner, outer), (rough_level(inner), patches, rare), wanted)
+
+
+def bound_box(
+    problem: Problem, model: Model, boxes: tuple[Plane, Plane | None], work: tuple[float, float, float], wanted: float
+) -> Found:
+    """Both bounds of log P, the lower one on the second box where the upper one is above ``wanted``.
+
+    ``work`` holds about log P, the patches that are granted, and ``rare`` of `bound_plane_above`.
+    """
+    (inner, outer), (level, patches, rare) = boxes, work
     upper, done, proposed = bound_plane_above(inner, model, level, patches, rare)
     below: list[Proposed] = []
-    if upper > wanted and not held_anywhere(inner):
-        outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
+    if upper > wanted and outer is not None:
         plan = plan_below(outer, min(level, upper), BELOW * patches)
         with contextlib.suppress(OutOfTime):
-            found = bound_plane_below(outer, model, plan, starts, points_of(problem))
+            found = bound_plane_below(outer, model, plan, outer.starts, points_of(problem))
             below += [] if found is None else [found]
         done.append(f"{plan.cells}^2 below")
     lower = max((payment.log for _, payment in below), default=None)

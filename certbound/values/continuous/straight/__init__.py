@@ -4,6 +4,6 @@
 `hypotheses`: exp(V) is e U and a constant, but for e^2, so that the theorem of V = log u becomes the linear one.
 """
 
-from certbound.values.continuous.straight.near_one import bound_plane
+from certbound.values.continuous.straight.near_one import bound_between, bound_plane
 
-__all__ = ["bound_plane"]
+__all__ = ["bound_between", "bound_plane"]

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -26,14 +29,14 @@ from certbound.values.continuous.hypotheses import (
     sampled_residual,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.plane import Plane, Source, held_plane, plane_of, rough_level, two_states
+from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]
-Found = tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]
+Other = Callable[[float, float], Found]
 
 _RARE = math.log(1e-7)
 _FEWEST, _MOST = 14, 60  # cells along each state
@@ -45,30 +48,42 @@ _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noise
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
+_WORSE = 1.5  # times the least one of those before: sources do not help any more
+_MUCH = 10.0  # times U at the starts: where a proof would pay more, another pass does not make it good
 _CLOSE = 0.05  # of log P between both bounds: no finer grid
+_LIKELY = 0.15  # of log P: as near to a rough guess nothing is wrong
 _ENOUGH = 0.25  # and nothing else is tried
 
 
 def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wanted: float) -> Found:
     """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
-    granted, starts = round(deadline - time.perf_counter(), 1), starts_of(problem)
-    inner = plane_of(problem, model, room.inner_low, room.inner_high, starts)
-    served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
-    if not served or held_plane(inner, model)[0] is not inner:
-        return two_states(problem, model, room, deadline, wanted)
+    inner = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
+    outer = replace(inner, low=_pair(room.outer_low), high=_pair(room.outer_high))
+    other = partial(two_states, problem, model, room)
+    if held_plane(inner, model)[0] is not inner:
+        return other(deadline, wanted)
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
-    outer = plane_of(problem, model, room.outer_low, room.outer_high, starts)
     if wanted < math.inf:
         check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
-    if not _RARE < rough_level(inner) < 0:
-        return two_states(problem, model, room, deadline, wanted)
+    return bound_between(problem, model, inner, outer, deadline, wanted, other)
+
+
+def bound_between(
+    problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other
+) -> Found:
+    """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due."""
+    granted = round(deadline - time.perf_counter(), 1)
+    served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
+    level = rough_level(inner)
+    if not served or not _RARE < level < 0:
+        return other(deadline, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below = list[Proposed](), list[Proposed]()
     most = min(math.sqrt(_SHARE * granted / _COST), _MOST)
     for cells in sorted({max(round(share * most), _FEWEST) for share in (_COARSE, 1.0)}):
         cost = _COST * cells**2
         try:
-            found = _bounded(inner, model, cells, None, below=False)
+            found = _bounded(inner, model, cells, level, None, below=False)
             done.append(f"{cells}^2")
             if found is not None and found[1].log < upper:
                 above.append(found)
@@ -76,8 +91,8 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
             spent += cost / 2
             if upper <= wanted < math.inf:
                 break
-            if wanted < math.inf:
-                found = _bounded(outer, model, cells, points_of(problem), below=True)
+            if outer is not None and wanted < math.inf:
+                found = _bounded(outer, model, cells, level, points_of(problem), below=True)
                 spent += cost / 2
                 if found is not None and found[1].log > lower:
                     below.append(found)
@@ -93,7 +108,7 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
     if upper <= wanted < math.inf or -math.inf < wanted < lower or upper - lower < _ENOUGH:
         return upper, least, words, (above, below)
     try:
-        log = two_states(problem, model, room, time.perf_counter() + granted - spent, wanted)
+        log = other(time.perf_counter() + granted - spent, wanted)
     except OutOfTime:
         return upper, least, words, (above, below)
     least = max((one for one in (least, log[1]) if one is not None), default=None)
@@ -102,19 +117,32 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
     return min(upper, log[0]), least, f"{words} and {log[2].rpartition('cells: ')[2]}", (above, below)
 
 
-def _bounded(plane: Plane, model: Model, cells: int, points: Array | None, *, below: bool) -> Proposed | None:
+def _pair(ends: tuple[float, ...]) -> tuple[float, float]:
+    return ends[0], ends[1]
+
+
+def _bounded(
+    plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool
+) -> Proposed | None:
     """The best bound of a few proposals: corrected by samples of the residual, then by its bounds."""
-    solver = Ramps(plane, cells, min(_LEAD / cells**2, 0.1) * plane.horizon, _MARGIN[below])
-    starts = plane.starts
-    surface, source, value = _corrected(solver, model, points, below)
-    if surface is None or not 0 < value < 1:
+    starts, kinds = plane.starts, list[tuple[float, float, Ramps, Surface, Source | None]]()
+    for eased in (False, True):
+        lead = min(_LEAD / cells**2, 0.1) * plane.horizon
+        solver = Ramps(plane, cells, lead, _MARGIN[below], eased=eased, below=below)
+        surface, source, value, promised = _corrected(solver, model, points, below)
+        if surface is not None and 0 < value < 1 and abs(promised - value) < _MUCH * value:
+            kinds.append((promised, value, solver, surface, source))
+            if promised > 0 and abs(math.log(promised) - level) < _LIKELY:
+                break
+    if not kinds:
         return None
+    _, value, solver, surface, source = (max if below else min)(kinds, key=lambda one: one[0])
     best: Proposed | None = None
     for factor in (*_AGAIN, None):
         spare = NEGLIGIBLE * SMALL * value
         payment: Payment | None
         if below:
-            payment, proof = proved_lower(surface, model, starts, points, spare)
+            payment, proof = proved_lower(surface, model, starts, points, spare, plane.cut)
             needed = -proof.ranges.residual_low
         else:
             payment, proof = proved_upper(surface, model, starts, (), spare)
@@ -135,23 +163,29 @@ def _bounded(plane: Plane, model: Model, cells: int, points: Array | None, *, be
 
 def _corrected(
     solver: Ramps, model: Model, points: Array | None, below: bool
-) -> tuple[Surface | None, Source | None, float]:
-    """The last proposal, its source, and about its bound."""
-    plane, source, value = solver.plane, None, 0.0
+) -> tuple[Surface | None, Source | None, float, float]:
+    """The proposal that promises most, its source, U at the starts and about the bound."""
+    plane, source = solver.plane, None
+    best: tuple[Surface | None, Source | None, float, float] = None, None, 0.0, math.inf
+    sign, least = -1 if below else 1, math.inf
     for factor in (*_FACTORS, None):
         surface = solver.surface(source, below=below)
         if not covers(surface, plane.horizon, plane.low, plane.high, within=not below):
             break
         value = 1 + extreme_over(surface, plane.starts, upper=not below, points=points) / SMALL
-        excess, _ = sampled_residual(surface, model, upper=not below, along=6)
-        needed = np.maximum(excess, 0.0) / SMALL
+        excess, level = sampled_residual(surface, model, upper=not below, along=6)
+        asked = level > -SMALL if below else level < 0  # where 0 < U < 1
+        needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / SMALL
         paid = float(needed.max(axis=(1, 2)) @ surface.steps)
         if not math.isfinite(paid) or value <= 0:
             break
-        if factor is None or paid < 2 * _LEFT * value:
-            return surface, source, value
+        if best[0] is None or sign * (value - best[3]) + paid < 0:
+            best = surface, source, value, value + sign * paid
+        if factor is None or paid < 2 * _LEFT * value or paid > _WORSE * least:
+            break
+        least = min(least, paid)
         source = _more(source, surface, factor * needed)
-    return None, None, value
+    return best
 
 
 def _more(source: Source | None, surface: Surface, needed: Array) -> Source:

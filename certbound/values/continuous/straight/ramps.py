@@ -9,9 +9,15 @@ along the face like the process whose motion across the face is left out; in a c
 1 - U in a corner is the product of what it is along both faces, and the equation holds there too.
 
 *Corners of noises that go together.* In coordinates in which they do not, a corner has another angle, some corners more
-than a right one, where second derivatives grow without limit: no source makes up for that. U of a box that is larger by
-a share of a cell on each side is smooth in the corners of its own box, and solves the same equation. The cells around
-it are left out of what is proposed.
+than a right one, where second derivatives grow without limit: no source makes up for that. U is that of a box that is
+larger by a share of a cell on each side, which is smooth in the corners of the box; the cells around it are left out of
+what is proposed. Where the model is not defined there, such corners are given up.
+
+*Given up* (`Plane.counted`) are those corners, and faces at which the box is only cut. U = -d there for lower bounds,
+1 + d for upper ones: below 0, and above 1, nothing is asked of it. Ramps of lower bounds weaken towards these places.
+
+*Eased*: U is drawn to that on the way (U_tau = ... - k (U + d) leaves a residual of the right sign), and the drift is
+weakened at faces from which it leads back faster than cells can follow.
 
 Lower bounds take U as it is. For upper bounds the ramp is over before T: U starts `SHIFT` ramps earlier, and is divided
 by its least value on the faces.
@@ -39,7 +45,9 @@ _RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a
 _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
 _LONGEST = 8  # steps of the horizon, at least
-_TOGETHER = 0.25  # a correlation that counts
+_CLOSELY = 0.25  # correlated: a wider box
+_PAST = 0.05  # d: how far beyond 0 and 1 U is where it is given up
+_ZONE = 6  # cells at a face where the drift back is weakened
 
 _R = 6**0.5
 _STAGES = np.array([(4 - _R) / 10, (4 + _R) / 10, 1.0])
@@ -63,21 +71,27 @@ class Ramps:
     solved is larger by ``margin`` times their correlation, in cells beside a face.
     """
 
-    def __init__(self, plane: Plane, cells: int, lead: float, margin: float = 0.0) -> None:
+    def __init__(
+        self, plane: Plane, cells: int, lead: float, margin: float = 0.0, *, eased: bool = False, below: bool = False
+    ) -> None:
         self.plane, self.lead = plane, lead
         nodes = [spread_nodes(plane, Plan(cells=cells, growth=_GROWTH, lead=lead), axis) for axis in (0, 1)]
         shared = _correlation(plane, nodes)
         wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
         for one, inner in zip(wide, nodes):
             one[[0, -1]] = inner[[0, -1]] + margin * shared * (one[[0, -1]] - inner[[0, -1]])
-        self.kept = slice(None)
-        if margin * shared > margin * _TOGETHER and _is_defined(plane, wide):
-            self.kept, nodes = slice(1, -1), wide
+        wider = margin > 0 and shared > _CLOSELY and _is_defined(plane, wide)
+        self.kept = slice(1, -1) if wider else slice(None)
+        nodes = wide if wider else nodes
         self.nodes, self.splines = nodes, [Splines(one) for one in nodes]
         x, y = np.meshgrid(*(one.points for one in self.splines), indexing="ij")
         (force,), a = plane.drift(0.0, x, y), plane.square(0.0, x, y) * np.ones((2, 2, *x.shape))
         on = np.zeros((2, *x.shape))  # faces across the first and across the second axis
         on[0, [0, -1]] = on[1, :, [0, -1]] = 1
+        share, lost = plane.counted(x, y, 0.0 if wider else 1.0)
+        led = share if below else np.ones(x.shape)
+        if eased:
+            force, led = self._eased(force, a, led, x, y, below)
         own = [[csr_matrix(table) for table in one.dense] for one in self.splines]
 
         def part(weight: Array, i: int, j: int) -> csr_matrix:
@@ -87,9 +101,39 @@ class Ramps:
         self.operator = part((1 - on[0]) * force[0], 1, 0) + part((1 - on[1]) * force[1], 0, 1)
         self.operator += part((1 - on[0]) * a[0, 0] / 2, 2, 0) + part((1 - on[1]) * a[1, 1] / 2, 0, 2)
         self.operator += part((1 - on[0]) * (1 - on[1]) * a[0, 1], 1, 1)
-        self.count = on.sum(axis=0).ravel()
-        self.edge, self.inner = np.flatnonzero(self.count), np.flatnonzero(self.count == 0)
+        met = on.sum(axis=0).ravel()
+        moves = ((met == 0) | (share.ravel() > 0)).astype(float)  # not on faces that are no limits
+        drawn, lost = -_PAST if below else 1 + _PAST, eased * moves * lost.ravel()
+        self.operator = csr_matrix(diags(moves) @ self.operator - diags(lost) @ self.mass)
+        self.count = met * led.ravel() * moves
+        self.edge, self.inner = np.flatnonzero(met), np.flatnonzero(met == 0)
+        self.moves, self.fed = moves, drawn * lost
+        self.first = splu(csc_matrix(self.mass)).solve(drawn * (1 - share.ravel()))
         self.factors: dict[float, tuple[object, object]] = {}
+
+    def _eased(self, force: Array, a: Array, led: Array, x: Array, y: Array, below: bool) -> tuple[Array, Array]:
+        """The drift and what faces count where the drift leads back into the box faster than cells can follow.
+
+        Above, that drift is weakened near faces: U rises towards them, so that the residual falls. Below, such faces
+        have U = 0, and it is weakened there too: U falls towards them, so that the residual rises.
+        """
+        force, place = force * np.ones((2, *x.shape)), (x, y)
+        weak, counted = force.copy(), led.copy()
+        for axis, side in itertools.product((0, 1), (0, 1)):
+            nodes = self.nodes[axis] if side == 0 else self.nodes[axis][::-1]
+            zone, away, sign = abs(nodes[_ZONE] - nodes[0]), np.abs(place[axis] - nodes[0]), 1 - 2 * side
+            most = a[axis, axis] * _ZONE / zone
+            near = np.clip(2 - 2 * away / zone, 0.0, 1.0)
+            near = near * near * (3 - 2 * near)
+            if below:
+                edge = np.take(sign * force[axis] / most, [-side], axis=axis)
+                slow = np.clip(2 - edge, 0.0, 1.0) * np.ones(x.shape)
+                slow = slow * slow * (3 - 2 * slow)
+                own = np.moveaxis(counted, axis, 0)
+                own[-side] *= np.moveaxis(slow, axis, 0)[-side]
+                near = near * (1 - np.take(counted, [-side], axis=axis))
+            weak[axis] -= sign * near * np.maximum(sign * force[axis] - most, 0.0)
+        return weak, counted
 
     def surface(self, source: Source | None, *, below: bool) -> Surface:
         """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
@@ -97,15 +141,16 @@ class Ramps:
         times, first = _times(horizon, shift, self.lead)
         sign = -1.0 if below else 1.0
         given = None if source is None else sign * source.at([one.points for one in self.splines])
-        value, rate = np.zeros(len(self.count)), np.zeros(len(self.count))
+        value = self.first
+        rate = splu(csc_matrix(self.mass)).solve(self.operator @ value + self.fed)
         values, rates = [value], [rate]
         for start, end in itertools.pairwise(times):
             poll("a proposal of the value function")
             step = end - start
             stages = [shift + horizon - (start + c * step) for c in _STAGES]
-            fed = np.zeros((3, len(value)))
+            fed = np.zeros((3, len(value))) + self.fed
             if source is not None and given is not None:
-                fed = np.stack([_at(source.times, given, t) for t in stages])
+                fed += self.moves * np.stack([_at(source.times, given, t) for t in stages])
             ages = start + _STAGES * step
             found = self._step(value, step, fed, ages)
             rate = _END_RATE @ np.vstack([value, found]) / step
