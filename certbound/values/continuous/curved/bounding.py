@@ -52,6 +52,9 @@ _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.1, 1.0)  # of the patches, for one grid after the other
 _STEEP = 1.0  # how far V falls at most over a cell at a wall, at the horizon
 _SAMPLES = (4, 5, 5)
+_SELDOM = math.log(1e-7)  # log P below which U itself is not proposed
+_LEAST, _COST, _MOST = 2.5, 0.0095, 60  # seconds that it takes, about those of a proposal over cells^2, most cells
+_NEARLY = 0.3  # of log P above a rough guess: then log U is proposed, too
 _RANK = 1e-9  # of the squared noise: a smaller share in some direction everywhere is none
 Squares = Callable[[float, Array, Array], Array]
 _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
@@ -61,9 +64,9 @@ def bound_region(
     problem: Problem, model: Model, deadline: float
 ) -> tuple[float, None, str, list[tuple[Surface, Payment]]]:
     """The upper bound on one grid after another; nothing is proposed for certificates, which know boxes only."""
-    plain, rare = model, -math.inf
+    plain, rare, granted = model, -math.inf, max(1.0, round(deadline - time.perf_counter(), 1))
     plane, region, level, model = _setting(problem, model)
-    patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
+    patches = _RATE * granted
     if not region.walls.groups:
         if any(itertools.chain(*plane.held)):
             plane, written, rare = released(problem, plane, plain, level)
@@ -71,8 +74,14 @@ def bound_region(
                 model, level = written, rough_level(plane)
         upper, done, _ = bound_plane_above(plane, model, level, patches, rare)
         return upper, None, f"value function in two states on a box that few paths leave, cells: {', '.join(done)}", []
-    upper, done = 0.0, []
-    for share in _SHARES:
+    upper, done = 0.0, list[str]()
+    if plane.autonomous and len(model.branches) == 1 and level > _SELDOM and granted >= _LEAST:
+        from certbound.values.continuous.curved.near_walls import bound_near_walls
+
+        cells = min(math.isqrt(int(granted / _COST)), _MOST)
+        upper = bound_near_walls(plane, region.walls, model, problem.initial, cells)
+        done.append(f"{cells}^2")
+    for share in _SHARES if upper > level + _NEARLY else ():
         plan = _plan(plane, level, share * patches)
         try:
             surface = _promising(plane, region.walls, model, plan, problem.initial)

@@ -28,7 +28,7 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Plane, Source, held_plane, plane_of, rough_level, two_states
 from certbound.values.continuous.room import Room, points_of, starts_of
-from certbound.values.continuous.straight.ramps import SMALL, Ramps
+from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -40,7 +40,6 @@ _FEWEST, _MOST = 14, 60  # cells along each state
 _COARSE = 0.55  # of the cells that may be afforded, for a first grid
 _COST = 0.01  # about the seconds of both sides, over cells^2
 _SHARE = 0.58  # of what may be spent, for the finer grid
-_LEAD = 6.0  # over cells^2: a ramp's share of the horizon
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
@@ -103,7 +102,7 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
 
 def _bounded(plane: Plane, model: Model, cells: int, points: Array | None, *, below: bool) -> Proposed | None:
     """The best bound of a few proposals: corrected by samples of the residual, then by its bounds."""
-    solver, starts = Ramps(plane, cells, min(_LEAD / cells**2, 0.1) * plane.horizon), plane.starts
+    solver, starts = Ramps(plane, cells, ramp_of(cells) * plane.horizon), plane.starts
     surface, source, value = _corrected(solver, model, points, below)
     if surface is None or not 0 < value < 1:
         return None
