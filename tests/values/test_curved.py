@@ -302,14 +302,18 @@ def test_a_certificate_that_cannot_state_a_curved_set_is_refused(monkeypatch: py
     assert bound_region is not exits.bound_region
 
 
-def test_the_probability_itself_is_proposed_within_a_disc_and_its_bound_holds_on_spoilt_proposals() -> None:
+def test_the_probability_itself_is_proposed_within_a_disc_and_its_bound_holds_on_spoilt_proposals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(near_walls, "_FACTORS", (0.9, 1.12))
+    monkeypatch.setattr(near_walls, "_SAMPLED", 1)
     problem, truth = in_disc(0.5, 0.7), leaving_a_disc(0.5, 0.7)
     model = exits._model(problem)
     region = region_of(problem, *floats_of(model), near=False)
     plane = plane_of(problem, model, region.low, region.high, starts_of(problem))
     found = near_walls.bound_near_walls(plane, region.walls, model, problem.initial, 9)
     assert math.log(truth) <= found < math.log(truth) + 1.0
-    surface = walled_ramps.WalledRamps(plane, region.walls, 8).surface(None, below=False)
+    surface = walled_ramps.WalledRamps(plane, region.walls, 7).surface(None, below=False)
     rng = np.random.default_rng(1)
     for size in (0.0, 1e-2):
         wrong = replace(surface, values=surface.values * (1 + size * rng.normal(size=surface.values.shape)))

@@ -24,7 +24,7 @@ from certbound.values.continuous.surface import Surface
 _CROWD = 0.7  # how much denser the grid is around walls than it would be
 _PLACES = (0.1127, 0.5, 0.8873)  # in a cell, along each state: Gauss's
 _ON_WALL = 3.0  # the weight of U = 1 on the walls, that of the equation being about 1 for U itself
-_AGE = 1.0  # of a ramp, in units of a cell's width squared over the noise's variance
+_AGE = 0.8  # of a ramp, in units of a cell's width squared over the noise's variance
 _LAYER, _ZONE = 1.5, 2.0  # widths of layers at faces, and of where the drift is weakened, in cells
 _SMOOTH = 1e-3  # of third differences of coefficients outside
 
