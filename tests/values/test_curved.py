@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,12 +16,16 @@ from certbound.rigor.intervals import Interval
 from certbound.safety.certificates.values import values_proof
 from certbound.safety.engines.values import values_engine
 from certbound.values.continuous import bound_exits, exits
-from certbound.values.continuous.curved import bound_region, bounding, proof, walled
+from certbound.values.continuous.curved import bound_region, bounding, near_walls, proof, walled, walled_ramps
 from certbound.values.continuous.curved.boundaries import Walls
 from certbound.values.continuous.curved.continuation import propose_within
 from certbound.values.continuous.curved.cuts import PARTS, Cuts
-from certbound.values.continuous.hypotheses import Need, up
-from certbound.values.continuous.plane import Plan
+from certbound.values.continuous.curved.region import region_of
+from certbound.values.continuous.hypotheses import Need, Proof, up
+from certbound.values.continuous.plane import Plan, floats_of, plane_of
+from certbound.values.continuous.residual import Ranges
+from certbound.values.continuous.room import starts_of
+from certbound.values.continuous.straight import SMALL
 from certbound.values.continuous.surface import Surface
 from tests.values.random_problems import check
 from tests.values.test_continuous import hermite_values, random_surface, read, spoilt
@@ -295,3 +300,37 @@ def test_a_certificate_that_cannot_state_a_curved_set_is_refused(monkeypatch: py
     with pytest.raises(CertificateError, match="no oblique or curved limits"):
         values_proof(problem, answer)
     assert bound_region is not exits.bound_region
+
+
+def test_the_probability_itself_is_proposed_within_a_disc_and_its_bound_holds_on_spoilt_proposals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(near_walls, "_FACTORS", (0.9, 1.12))
+    monkeypatch.setattr(near_walls, "_SAMPLED", 1)
+    problem, truth = in_disc(0.5, 0.7), leaving_a_disc(0.5, 0.7)
+    model = exits._model(problem)
+    region = region_of(problem, *floats_of(model), near=False)
+    plane = plane_of(problem, model, region.low, region.high, starts_of(problem))
+    found = near_walls.bound_near_walls(plane, region.walls, model, problem.initial, 9)
+    assert math.log(truth) <= found < math.log(truth) + 1.0
+    surface = walled_ramps.WalledRamps(plane, region.walls, 7).surface(None, below=False)
+    rng = np.random.default_rng(1)
+    for size in (0.0, 1e-2):
+        wrong = replace(surface, values=surface.values * (1 + size * rng.normal(size=surface.values.shape)))
+        sketch = near_walls._Sketch.of(wrong.raised(-0.1 * SMALL), region.walls, model, problem.initial)
+        assert sketch.proved(region.walls, model)[0] >= math.log(truth)
+
+
+def test_a_payment_by_the_logarithm_says_nothing_of_functions_that_fall_far_below_0() -> None:
+    none = np.zeros(0)
+    ranges = Ranges(residual_low=none, residual_high=none, low=none, high=none, energy=none)
+    seen = Proof(ranges=ranges, slab=none.astype(int), cell=none.astype(int))
+    still = np.zeros((2, 2, 3, 2, 3))
+    flat = Surface(
+        axes=(np.array([0.0, 1.0]),) * 2, times=np.array([0.0, 1.0]), values=still, start_rates=still[:1],
+        end_rates=still[:1],
+    )  # fmt: skip
+    start = SMALL * (0.1 - 1)
+    paid = [near_walls.relative_payment(seen, flat, start, SMALL * (u - 1), 1e-9).log for u in (0.0, -0.5, -20)]
+    assert math.log(0.1) - 1e-9 <= paid[0] < math.log(0.1) + 0.01
+    assert math.log(0.5) < paid[1] < 0 == paid[2]

@@ -168,7 +168,7 @@ class Splines:
         self.points = np.array([knots[k + 1 : k + degree + 1].mean() for k in range(self.count)])
         self.points[0], self.points[-1] = nodes[0], nodes[-1]
         spline = BSpline(knots, np.eye(self.count), degree)
-        self.band = degree
+        self.band, self.spline = degree, spline
         self.dense = [spline(self.points, order) for order in range(3)]
         self.at = [self._banded(matrix) for matrix in self.dense]
         self.at_nodes = [spline(nodes, order) for order in range(3)]

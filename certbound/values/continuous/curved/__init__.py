@@ -1,7 +1,8 @@
 """Two states among curved limits and obstacles: upper bounds (docs/values.md, "Curved limits and obstacles").
 
 From the bottom: ``boundaries`` (what is safe, in outward-rounded arithmetic), ``region`` (a box around it), ``cuts``
-(the cells and parts of cells that it meets), ``proof``, ``continuation`` (proposals), ``bounding``.
+(the cells and parts of cells that it meets), ``proof``, ``continuation`` (proposals of log U), ``walled_ramps`` and
+``near_walls`` (of U), ``bounding``.
 """
 
 from certbound.values.continuous.curved.bounding import bound_region

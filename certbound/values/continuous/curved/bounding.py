@@ -53,6 +53,9 @@ _VARIED = 1.0  # about how much V varies on a patch
 _SHARES = (0.1, 1.0)  # of the patches, for one grid after the other
 _STEEP = 1.0  # how far V falls at most over a cell at a wall, at the horizon
 _SAMPLES = (4, 5, 5)
+_SELDOM = math.log(1e-7)  # log P below which U itself is not proposed
+_LEAST, _COST, _MOST = 2.5, 0.009, 60  # seconds that it takes, about those of a proposal over cells^2, most cells
+_NEARLY = 0.3  # of log P above a rough guess: then log U is proposed, too
 _RANK = 1e-9  # of the squared noise: a smaller share in some direction everywhere is none
 Squares = Callable[[float, Array, Array], Array]
 Between = Callable[[Problem, Model, Plane, Plane | None, float, float, Callable[[float, float], Found]], Found]
@@ -64,14 +67,20 @@ def bound_region(problem: Problem, model: Model, deadline: float, wanted: float,
 
     In a box ``between`` (`straight.bound_between`) is asked first. Certificates know no curved limits.
     """
-    plain = model
+    plain, granted = model, max(1.0, round(deadline - time.perf_counter(), 1))
     plane, region, level, model = _setting(problem, model)
     if not region.walls.groups:
         upper, lower, words, stated = _in_box(problem, plain, model, (plane, level), deadline, wanted, between)
         return upper, lower, words.replace("two states", "two states on a box that few paths leave"), stated
-    patches = _RATE * max(1.0, round(deadline - time.perf_counter(), 1))
-    upper, done = 0.0, []
-    for share in _SHARES:
+    patches = _RATE * granted
+    upper, done = 0.0, list[str]()
+    if plane.autonomous and len(model.branches) == 1 and level > _SELDOM and granted >= _LEAST:
+        from certbound.values.continuous.curved.near_walls import bound_near_walls
+
+        cells = min(math.isqrt(int(granted / _COST)), _MOST)
+        upper = bound_near_walls(plane, region.walls, model, problem.initial, cells)
+        done.append(f"{cells}^2")
+    for share in _SHARES if upper > level + _NEARLY else ():
         plan = _plan(plane, level, share * patches)
         try:
             surface = _promising(plane, region.walls, model, plan, problem.initial)

@@ -43,21 +43,10 @@ class _Fenced(Solver):
         self.curve = wall_points(walls, plane, 4 * plan.cells)
         super().__init__(plane, plan, source)
         self.edge = self.edge | self.outside
-        limits = _Limits(walls, plane, self.curve)
-        self.filling = _filling(limits, self.x, self.y, self.widths, self.outside)
+        self.filling = _filling(_Limits(walls, plane, self.curve), self.x, self.y, self.widths, self.outside)
 
     def grid(self, axis: int) -> Array:
-        places = self.curve[:, axis]
-        if not len(places):
-            return spread_nodes(self.plane, self.plan, axis)
-        low, high = places.min(), places.max()
-        margin = 0.1 * (self.plane.high[axis] - self.plane.low[axis])
-
-        def more(fine: Array) -> Array:
-            away = np.maximum(np.maximum(low - fine, fine - high), 0.0)
-            return np.asarray(1 + _CROWD / (1 + (away / margin) ** 2))
-
-        return spread_nodes(self.plane, self.plan, axis, more)
+        return crowded_nodes(self.plane, self.plan, axis, self.curve)
 
     @functools.cached_property
     def depth(self) -> Array:
@@ -106,6 +95,21 @@ class _Fenced(Solver):
     def step(self, tau: float, value: Array, h: float) -> Array:
         new = super().step(tau, value, h)
         return np.where(self.outside, (1 - _FOLLOW) * value + _FOLLOW * self._filled(new), new)
+
+
+def crowded_nodes(plane: Plane, plan: Plan, axis: int, curve: Array, crowd: float = _CROWD) -> Array:
+    """Nodes along an axis, denser around the walls' points ``curve``."""
+    places = curve[:, axis]
+    if not len(places):
+        return spread_nodes(plane, plan, axis)
+    low, high = places.min(), places.max()
+    margin = 0.1 * (plane.high[axis] - plane.low[axis])
+
+    def more(fine: Array) -> Array:
+        away = np.maximum(np.maximum(low - fine, fine - high), 0.0)
+        return np.asarray(1 + crowd / (1 + (away / margin) ** 2))
+
+    return spread_nodes(plane, plan, axis, more)
 
 
 def wall_points(walls: Walls, plane: Plane, count: int) -> Array:

@@ -37,6 +37,7 @@ from certbound.values.continuous.hypotheses import (
     up,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
+from certbound.values.continuous.polynomials import QUARTERS
 from certbound.values.continuous.residual import Patches, Ranges, bound_ranges, coarse_size, value_range
 from certbound.values.continuous.surface import Surface
 
@@ -49,6 +50,7 @@ _ELEVATE = np.array([
 ])  # fmt: skip
 """Bernstein coefficients of degree 5 from those of degree 2, each entry rounded once."""
 _DEEPEST = 7
+_FINER = 16  # parts of a part of a cell, where V on a wall is looked at
 
 
 def raised_over_walls(surface: Surface, cuts: Cuts) -> Surface:
@@ -73,22 +75,47 @@ def least_on_walls(surface: Surface, cuts: Cuts) -> float:
             place = np.flatnonzero(np.tile(mask, last - first))
             chosen = np.flatnonzero(mask)
             ends = tuple((left[chosen], right[chosen]) for left, right in cuts.ends)
-            least = min(least, float(_least_where(parts.take(place), wall, ends, last - first).min()))
+            least = min(least, float(_on_wall(parts.take(place), wall, ends, last - first).min()))
     return least
 
 
-def _least_where(patches: Patches, wall: Wall, ends: tuple[tuple[Interval, Interval], ...], slabs: int) -> Array:
-    """Lower bounds of V over each patch where g = 0."""
+def _on_wall(patches: Patches, wall: Wall, ends: tuple[tuple[Interval, Interval], ...], slabs: int) -> Array:
+    """Lower bounds of V over each patch where g = 0, by parts of it that the wall may meet."""
+    patches, ends = _quartered(patches, ends)
     found = wall.bernstein(ends)
     table = np.einsum("ai,sij,bj->sab", _ELEVATE, found.mid, _ELEVATE)
     size = np.abs(table).max(axis=(1, 2))
     off = found.rad.max(axis=(1, 2)) + 40 * _UNIT * size
+    missed = (found.lo.min(axis=(1, 2)) > 0) | (found.hi.max(axis=(1, 2)) < 0)
     table, size, off = (np.tile(part, (slabs, *[1] * (part.ndim - 1))) for part in (table, size, off))
     factor = _ratio(patches.coefficients, table)
     moved = patches.coefficients + factor[:, :, None, None] * table[:, None]
     slack = _UNIT * (1000 * (patches.size + np.abs(patches.reference)) + 10 * np.abs(factor).max(axis=1) * size)
     slack += np.abs(factor).max(axis=1) * off * (1 + 1e-12)
-    return np.asarray(patches.reference + moved.reshape(len(moved), -1).min(axis=1) - slack)
+    low = patches.reference + moved.reshape(len(moved), -1).min(axis=1) - slack
+    return np.asarray(np.where(np.tile(missed, slabs), np.inf, low).reshape(-1, _FINER).min(axis=1))
+
+
+def _quartered(
+    patches: Patches, ends: tuple[tuple[Interval, Interval], ...]
+) -> tuple[Patches, tuple[tuple[Interval, Interval], ...]]:
+    """Each patch in `_FINER` equal parts, one after the other; enclosed ends of the parts of one slab."""
+    shares = np.arange(5) / 4
+    finer = np.einsum("pai,qbj,ktij->kpqtab", QUARTERS, QUARTERS, patches.coefficients, optimize=True)
+    coefficients = finer.reshape(-1, *patches.coefficients.shape[1:])
+    widths = tuple(np.repeat(width / 4, _FINER) for width in patches.widths)
+    reference, size, step = (np.repeat(one, _FINER) for one in (patches.reference, patches.size, patches.step))
+    parts = Patches(coefficients=coefficients, reference=reference, size=size, step=step, widths=widths)
+    places = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
+    found = []
+    for (left, right), place in zip(ends, places):
+        width = right - left
+        first, last = (
+            (left[:, None] + width[:, None] * Interval.point(shares[place.ravel() + k])[None]).reshape(-1)
+            for k in (0, 1)
+        )
+        found.append((first, last))
+    return parts, (found[0], found[1])
 
 
 def _ratio(coefficients: Array, table: Array) -> Array:

@@ -5,5 +5,6 @@
 """
 
 from certbound.values.continuous.straight.near_one import bound_between, bound_plane
+from certbound.values.continuous.straight.ramps import SMALL, Ramps, Solve, left_at, ramp_of, stage_rates
 
-__all__ = ["bound_between", "bound_plane"]
+__all__ = ["SMALL", "Ramps", "Solve", "bound_between", "bound_plane", "left_at", "ramp_of", "stage_rates"]

@@ -31,7 +31,7 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
 from certbound.values.continuous.room import Room, points_of, starts_of
-from certbound.values.continuous.straight.ramps import SMALL, Ramps
+from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -43,7 +43,6 @@ _FEWEST, _MOST = 14, 60  # cells along each state
 _COARSE = 0.55  # of the cells that may be afforded, for a first grid
 _COST = 0.01  # about the seconds of both sides, over cells^2
 _SHARE = 0.58  # of what may be spent, for the finer grid
-_LEAD = 6.0  # over cells^2: a ramp's share of the horizon
 _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noises: lower bounds need more
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
@@ -127,8 +126,7 @@ def _bounded(
     """The best bound of a few proposals: corrected by samples of the residual, then by its bounds."""
     starts, kinds = plane.starts, list[tuple[float, float, Ramps, Surface, Source | None]]()
     for eased in (False, True):
-        lead = min(_LEAD / cells**2, 0.1) * plane.horizon
-        solver = Ramps(plane, cells, lead, _MARGIN[below], eased=eased, below=below)
+        solver = Ramps(plane, cells, ramp_of(cells) * plane.horizon, _MARGIN[below], eased=eased, below=below)
         surface, source, value, promised = _corrected(solver, model, points, below)
         if surface is not None and 0 < value < 1 and abs(promised - value) < _MUCH * value:
             kinds.append((promised, value, solver, surface, source))

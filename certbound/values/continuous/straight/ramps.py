@@ -26,6 +26,7 @@ by its least value on the faces.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix, diags, eye, kron, vstack
@@ -38,9 +39,12 @@ from certbound.values.continuous.proposal import Splines
 from certbound.values.continuous.surface import Surface
 from certbound.watch import poll
 
+Solve = Callable[[Array], Array]
+
 SHIFT = 2.5
 SMALL = 2.0**-8
 """e of V = e (U - 1)."""
+_LEAD = 6.0  # over cells^2: a ramp's share of the horizon
 _RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a ramp
 _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
@@ -75,7 +79,7 @@ class Ramps:
         self, plane: Plane, cells: int, lead: float, margin: float = 0.0, *, eased: bool = False, below: bool = False
     ) -> None:
         self.plane, self.lead = plane, lead
-        nodes = [spread_nodes(plane, Plan(cells=cells, growth=_GROWTH, lead=lead), axis) for axis in (0, 1)]
+        nodes = [self.grid(axis, Plan(cells=cells, growth=_GROWTH, lead=lead)) for axis in (0, 1)]
         shared = _correlation(plane, nodes)
         wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
         for one, inner in zip(wide, nodes):
@@ -84,7 +88,7 @@ class Ramps:
         self.kept = slice(1, -1) if wider else slice(None)
         nodes = wide if wider else nodes
         self.nodes, self.splines = nodes, [Splines(one) for one in nodes]
-        x, y = np.meshgrid(*(one.points for one in self.splines), indexing="ij")
+        x, y = self.places = np.meshgrid(*(one.points for one in self.splines), indexing="ij")
         (force,), a = plane.drift(0.0, x, y), plane.square(0.0, x, y) * np.ones((2, 2, *x.shape))
         on = np.zeros((2, *x.shape))  # faces across the first and across the second axis
         on[0, [0, -1]] = on[1, :, [0, -1]] = 1
@@ -107,9 +111,22 @@ class Ramps:
         self.operator = csr_matrix(diags(moves) @ self.operator - diags(lost) @ self.mass)
         self.count = met * led.ravel() * moves
         self.edge, self.inner = np.flatnonzero(met), np.flatnonzero(met == 0)
-        self.moves, self.fed = moves, drawn * lost
+        self.moves, self.drawn = moves, drawn * lost
         self.first = splu(csc_matrix(self.mass)).solve(drawn * (1 - share.ravel()))
-        self.factors: dict[float, tuple[object, object]] = {}
+        self.factors: dict[float, tuple[Solve, Solve]] = {}
+
+    def grid(self, axis: int, plan: Plan) -> Array:
+        """The nodes along an axis."""
+        return spread_nodes(self.plane, plan, axis)
+
+    def fed(self, source: Source) -> Array:
+        """A source where the equation asks for it, shape (K + 1, m)."""
+        found = source.at([one.points for one in self.splines])
+        return np.asarray(self.moves * found.reshape(len(found), -1))
+
+    def least(self, whole: Surface) -> float:
+        """A lower bound of U where paths fail."""
+        return min(whole.face_range(axis, side)[0] for axis in (0, 1) for side in (0, 1))
 
     def _eased(self, force: Array, a: Array, led: Array, x: Array, y: Array, below: bool) -> tuple[Array, Array]:
         """The drift and what faces count where the drift leads back into the box faster than cells can follow.
@@ -140,17 +157,17 @@ class Ramps:
         horizon, shift = self.plane.horizon, 0.0 if below else SHIFT * self.lead
         times, first = _times(horizon, shift, self.lead)
         sign = -1.0 if below else 1.0
-        given = None if source is None else sign * source.at([one.points for one in self.splines])
+        given = None if source is None else sign * self.fed(source)
         value = self.first
-        rate = splu(csc_matrix(self.mass)).solve(self.operator @ value + self.fed)
+        rate = splu(csc_matrix(self.mass)).solve(self.operator @ value + self.drawn)
         values, rates = [value], [rate]
         for start, end in itertools.pairwise(times):
             poll("a proposal of the value function")
             step = end - start
             stages = [shift + horizon - (start + c * step) for c in _STAGES]
-            fed = np.zeros((3, len(value))) + self.fed
+            fed = np.zeros((3, 1))
             if source is not None and given is not None:
-                fed += self.moves * np.stack([_at(source.times, given, t) for t in stages])
+                fed = np.stack([_at(source.times, given, t) for t in stages])
             ages = start + _STAGES * step
             found = self._step(value, step, fed, ages)
             rate = _END_RATE @ np.vstack([value, found]) / step
@@ -161,29 +178,41 @@ class Ramps:
 
     def _step(self, value: Array, step: float, fed: Array, ages: Array) -> Array:
         """U at the three stages: the faces first, which do not depend on what is inside."""
+        edges = self.edges(value, step, fed * np.ones(len(value)), ages)
+        right = np.outer(stage_rates(step), np.asarray(self.mass @ value)) + fed + self.drawn
+        right[:, self.edge] = edges
+        return self.solved(step, right)
+
+    def edges(self, value: Array, step: float, fed: Array, ages: Array) -> Array:
+        """The coefficients of the faces at the three stages."""
         edge = self.edge
-        right = np.outer(_INVERSE.sum(axis=1) / step, np.asarray(self.mass @ value)) + fed
         x = ages / self.lead
         fall = _RATE * x * x / (1 + x**3) / self.lead
         own, moved = self.mass[edge][:, edge], self.operator[edge][:, edge]
         decay = kron(diags(fall), diags(self.count[edge]) @ own)
         system = kron(csr_matrix(_INVERSE / step), own) - kron(eye(3), moved) + decay
-        gained = right[:, edge] + np.outer(fall, self.count[edge])
-        right[:, edge] = splu(csc_matrix(system)).solve(gained.ravel()).reshape(3, -1)
+        gained = np.outer(stage_rates(step), np.asarray(self.mass @ value)[edge]) + fed[:, edge] + self.drawn[edge]
+        gained = gained + np.outer(fall, self.count[edge])
+        return np.asarray(splu(csc_matrix(system)).solve(gained.ravel()).reshape(3, -1))
+
+    def solved(self, step: float, right: Array) -> Array:
+        """The three stages from their right-hand sides: one real and one complex system."""
         if step not in self.factors:
-            self.factors[step] = self._factor(_ROOTS[_REAL].real / step), self._factor(_ROOTS[_PAIR] / step)
+            self.factors[step] = self.factor(_ROOTS[_REAL].real / step), self.factor(_ROOTS[_PAIR] / step)
         real, pair = self.factors[step]
         turned = _FROM @ right
-        parts = np.outer(_TO[:, _REAL], real.solve(np.ascontiguousarray(turned[_REAL].real)))  # type: ignore[attr-defined]
-        parts = parts + 2 * np.outer(_TO[:, _PAIR], pair.solve(turned[_PAIR]))  # type: ignore[attr-defined]
+        parts = np.outer(_TO[:, _REAL], real(np.ascontiguousarray(turned[_REAL].real)))
+        parts = parts + 2 * np.outer(_TO[:, _PAIR], pair(turned[_PAIR]))
         return np.asarray(parts.real)
 
-    def _factor(self, root: complex) -> object:
+    def factor(self, root: complex) -> Solve:
+        """What solves (root - operator) u = r with the coefficients of the faces given."""
         whole = vstack([
             (root * self.mass - self.operator)[self.inner], eye(len(self.count), format="csr")[self.edge]
         ], format="csr")  # fmt: skip
         order = np.argsort(np.concatenate([self.inner, self.edge]))
-        return splu(csc_matrix(whole[order]))
+        solve: Solve = splu(csc_matrix(whole[order])).solve
+        return solve
 
     def _written(self, times: Array, values: list[Array], rates: list[Array], below: bool) -> Surface:
         maps = [np.stack(one.at_nodes, axis=1) for one in self.splines]
@@ -202,10 +231,24 @@ class Ramps:
             return found.raised(shift)
 
         whole = made(1.0, 0.0)
-        faces = [whole.face_range(axis, side) for axis in (0, 1) for side in (0, 1)]
         if below:  # U may rise over 1 beside corners
             return made(SMALL / max(1.0, top_of(whole)), -SMALL)
-        return made(SMALL / max(min(low for low, _ in faces), 0.5), -SMALL)
+        return made(SMALL / max(self.least(whole), 0.5), -SMALL)
+
+
+def ramp_of(cells: int) -> float:
+    """A ramp's share of the horizon."""
+    return min(_LEAD / cells**2, 0.1)
+
+
+def stage_rates(step: float) -> Array:
+    """What the value at a step's beginning adds to the right-hand sides of its three stages."""
+    return np.asarray(_INVERSE.sum(axis=1) / step)
+
+
+def left_at(ages: Array) -> Array:
+    """1 - U on a wall along which nothing moves, at ages in units of the ramp: it falls at `_RATE`."""
+    return np.asarray((1 + ages**3) ** (-_RATE / 3))
 
 
 def _correlation(plane: Plane, nodes: list[Array]) -> float:
