@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
+import contextlib
 import difflib
 import logging
 import re
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from typing import Annotated
 
 import typer
@@ -32,6 +35,7 @@ from certbound.watch import OutOfTime
 
 _ClickException = typer.BadParameter.__mro__[2]  # whichever click typer brings: vendored or its own
 _log = logging.getLogger(__name__)
+_AGAIN = 0.05  # seconds
 
 app = typer.Typer(
     name="certbound",
@@ -74,9 +78,31 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _run(words, command)
 
 
-def _run(words: list[str], command: str) -> int:
+@contextlib.contextmanager
+def _interrupts() -> Iterator[list[BaseException]]:
+    """Those that came within a callback of compiled code, which drops them: they come again soon."""
+    told, lost, again = sys.unraisablehook, list[BaseException](), threading.Timer(_AGAIN, _thread.interrupt_main)
+
+    def dropped(what: sys.UnraisableHookArgs) -> None:
+        if not isinstance(what.exc_value, KeyboardInterrupt):
+            told(what)
+        elif not lost:
+            lost.append(what.exc_value)
+            again.start()
+
+    sys.unraisablehook = dropped
     try:
-        code = app(args=words, prog_name="certbound", standalone_mode=False)
+        yield lost
+    finally:
+        again.cancel()
+        sys.unraisablehook = told
+
+
+def _run(words: list[str], command: str) -> int:
+    lost: list[BaseException] = []
+    try:
+        with _interrupts() as lost:
+            code = app(args=words, prog_name="certbound", standalone_mode=False)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
@@ -87,7 +113,9 @@ def _run(words: list[str], command: str) -> int:
         return _report(SolverError("nothing was proved in time; give a larger --time-limit"), command, words)
     except Exception as error:  # noqa: BLE001  (the outermost frame: whatever happened, three lines)
         _log.debug("the command ended with an error", exc_info=True)
-        return _report(error, command, words)
+        if not lost:
+            return _report(error, command, words)
+        code = INTERRUPTED
     if code == INTERRUPTED:
         kept = next((word for word in ("--checkpoint", "--resume") if word in words), "")
         _tell(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from certbound.cli.app import run
+from certbound.cli.app import _interrupts, run
 from tests.cli.problem_files import GOOD, STEPS, change
 
 MODULE = """
@@ -272,11 +274,28 @@ def test_an_interrupted_run(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_interruption_that_compiled_code_drops_comes_again() -> None:
+    class Dropped:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt
+
+    def waited() -> None:
+        with _interrupts() as lost:
+            Dropped()
+            assert lost
+            time.sleep(10)
+
+    before, hook = signal.signal(signal.SIGINT, signal.default_int_handler), sys.unraisablehook
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            waited()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sys.unraisablehook is hook
+
+
 def test_a_program_that_is_stopped_from_outside(tmp_path: Path) -> None:
     """Ctrl-C in a terminal: SIGINT to the installed program."""
-    import signal
-    import time
-
     command = [sys.executable, "-m", "certbound", "simulate", "ou", "--paths", "1e12", "--step", "0.005"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     # a program in the background of a shell inherits that Ctrl-C is ignored

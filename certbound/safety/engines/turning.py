@@ -34,10 +34,13 @@ def scales_of(problem: Problem) -> Array | None:
     system, n = problem.system, problem.system.dimension
     if not isinstance(system, ContinuousSystem) or not _is_plain(problem) or not np.isfinite(problem.horizon):
         return None
-    hull, box = problem.initial.hull(), system.disturbance
-    pushes = [] if box is None else list((box.low + box.high) / 2)
+    hull = problem.initial.hull()
     place = [np.float64(value) for value in (0.0, *(hull.lo + hull.hi) / 2)]
+    signals = [box for box in (system.inputs, system.disturbance) if box is not None]
+    missing = len(problem.closed_loop.inputs) - len(place)
     with np.errstate(all="ignore"):
+        pushes = [np.nan_to_num(value) for box in signals for value in (box.low + box.high) / 2]
+        pushes = pushes[len(pushes) - missing :]  # an input that follows the state is none
         slopes = np.asarray(compile_numpy(jacobian(problem.closed_loop, tuple(range(1, n + 1))))(*place, *pushes))
         given = system.diffusion
         gain = np.asarray(compile_numpy(given)(*place) if isinstance(given, Tape) else given, dtype=float)
