@@ -46,6 +46,7 @@ _SHARE = 0.58  # of what may be spent, for the finer grid
 _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noises: lower bounds need more
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
+_VAIN = 0.1  # of the cost, of a proposal that is not proved
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
 _WORSE = 1.5  # times the least one of those before: sources do not help any more
 _MUCH = 10.0  # times U at the starts: where a proof would pay more, another pass does not make it good
@@ -87,12 +88,12 @@ def bound_between(
             if found is not None and found[1].log < upper:
                 above.append(found)
                 upper = found[1].log
-            spent += cost / 2
+            spent += cost / 2 if found is not None else _VAIN * cost
             if upper <= wanted < math.inf:
                 break
             if outer is not None and wanted < math.inf:
                 found = _bounded(outer, model, cells, level, points_of(problem), below=True)
-                spent += cost / 2
+                spent += cost / 2 if found is not None else _VAIN * cost
                 if found is not None and found[1].log > lower:
                     below.append(found)
                     lower = found[1].log
