@@ -79,7 +79,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _interrupts() -> Iterator[list[BaseException]]:
+def interruptible() -> Iterator[list[BaseException]]:
     """Those that came within a callback of compiled code, which drops them: they come again soon."""
     told, lost, again = sys.unraisablehook, list[BaseException](), threading.Timer(_AGAIN, _thread.interrupt_main)
 
@@ -101,7 +101,7 @@ def _interrupts() -> Iterator[list[BaseException]]:
 def _run(words: list[str], command: str) -> int:
     lost: list[BaseException] = []
     try:
-        with _interrupts() as lost:
+        with interruptible() as lost:
             code = app(args=words, prog_name="certbound", standalone_mode=False)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from certbound.cli.app import _interrupts, run
+from certbound.cli.app import interruptible, run
 from tests.cli.problem_files import GOOD, STEPS, change
 
 MODULE = """
@@ -280,7 +280,7 @@ def test_an_interruption_that_compiled_code_drops_comes_again() -> None:
             raise KeyboardInterrupt
 
     def waited() -> None:
-        with _interrupts() as lost:
+        with interruptible() as lost:
             Dropped()
             assert lost
             time.sleep(10)
