@@ -255,8 +255,7 @@ def test_a_half_plane_is_left_as_often_as_one_state_says() -> None:
     truth = bound_exits(alone, seconds=1.0)
     assert truth.lower is not None
     assert truth.lower < found.upper < truth.upper + np.log10(2.5)
-    assert found.lower is None
-    assert not found.proposed
+    assert found.lower is None or found.lower < truth.upper
 
 
 def test_the_worst_point_of_a_ball_of_starts_counts_and_starts_at_a_wall_are_lost() -> None:

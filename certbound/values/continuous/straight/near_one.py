@@ -38,7 +38,7 @@ from certbound.watch import OutOfTime
 Proposed = tuple[Surface, Payment]
 Other = Callable[[float, float], Found]
 
-_RARE = math.log(1e-7)
+_RARE = math.log(1e-3)  # below that, logarithms serve better and need the time
 _FEWEST, _MOST = 14, 60  # cells along each state
 _COARSE = 0.55  # of the cells that may be afforded, for a first grid
 _COST = 0.01  # about the seconds of both sides, over cells^2
@@ -76,7 +76,7 @@ def bound_between(
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
     level = rough_level(inner)
     if not served or not _RARE < level < 0:
-        return other(deadline, wanted)
+        return other(time.perf_counter() + granted, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below = list[Proposed](), list[Proposed]()
     most = min(math.sqrt(_SHARE * granted / _COST), _MOST)
