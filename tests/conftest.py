@@ -30,8 +30,9 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _kernel_cache(request: pytest.FixtureRequest):
-    folder = Path(request.config.cache.mkdir("kernels"))
+def _kernel_cache(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    cache = getattr(request.config, "cache", None)  # none with -p no:cacheprovider
+    folder = tmp_path_factory.mktemp("kernels") if cache is None else Path(cache.mkdir("kernels"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CERTBOUND_CACHE", str(folder))
         yield
