@@ -59,6 +59,11 @@ def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["normal"] = exact([0.1, 0.2])
 
 
+@forges("noise is exact in other coordinates", "turned", _TURNED, "_noise", "`problem.noise` is not exact")
+def _(data: Data) -> None:
+    data["problem"]["noise"]["diffusion"] = exact([[0.1, 0.0], [0.001, 0.02]])
+
+
 @forges("a limit is the stated one in other coordinates", "turned", _TURNED, "_constraint", BEYOND)
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["normal"] = exact([1.5, -1.0])

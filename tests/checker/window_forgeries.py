@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from scipy.special import ndtr
 
 import certbound as cb
 from certbound.safety.answers import exact
+from certbound.safety.certificate import problem_data
 from certbound.safety.certificates.parts import packed
 from certbound.values.continuous import ExitBounds, bound_exits
 from certbound.values.continuous.line import ladder
@@ -51,9 +54,42 @@ def _written(build: Callable[[], cb.Problem], *, lower: bool) -> Callable[[], st
     return _sharp(lambda: answered(build(), _found(build), lower=lower))
 
 
+def ended_early() -> str:
+    """Noise alone, its domain left by many before a narrow limit counts: exp(V) is 1 - u, u = 0 when that begins."""
+    system = cb.ContinuousSystem(lambda x: 0 * x, states=1, diffusion=[[1.0]])
+    safe = [cb.Inside(cb.Box([-0.2], [0.2]), during=(0.5, 1.0))]
+    problem = cb.Problem(system, initial=[0], safe=safe, domain=cb.Box([-1], [1]), leaving="ends", horizon=1, delta=0.9)
+    axis, times = np.linspace(-1.001, 1.001, 17), 0.5 - np.linspace(0.5**0.5, 0, 9) ** 2
+    times[[0, -1]] = 0, 0.5
+    spread = np.sqrt(np.maximum(0.5 - times, 1e-4))[:, None]
+    w = np.zeros((5, 9, 17))
+    w[0] = 1
+    for sign in (1, -1):  # u and its derivatives
+        z = (sign * axis - 1.4) / spread
+        hermite = (1, -z / spread, (z * z - 1) / spread**2, (3 * z - z**3) / spread**3)
+        w[0] -= 2.5 * ndtr(z)
+        for k, part in enumerate(hermite, 1):
+            w[k] -= 2.5 * sign**k * np.exp(-z * z / 2) / np.sqrt(2 * np.pi) / spread * part
+    slope, moved = w[1] / w[0], -w[2] / 2 / w[0]
+    turned = -w[3] / 2 / w[0] - slope * moved
+    values = np.stack([np.log(w[0]), slope, w[2] / w[0] - slope**2], axis=-1)
+    bent = -w[4] / 2 / w[0] - w[2] / w[0] * moved - 2 * slope * turned
+    stages = []
+    for nodes, ends, table in ((axis, times, (values, np.stack([moved, turned, bent], axis=-1))),
+                               (np.array([-0.2, 0.2]), np.array([0.5, 1]), np.zeros((2, 2, 2, 3)))):  # fmt: skip
+        none = exact([0.0] * (len(ends) - 1))
+        stages.append({"axes": [exact(nodes)], "times": exact(ends), "lam": none, "eps": none}
+                      | {"values": packed(table[0]), "rates": packed(table[1])})  # fmt: skip
+    data = json.loads(_written(passing, lower=False)()) | {"problem": problem_data(problem)}
+    data["claim"]["log10_delta"] = exact(0.0)
+    flat = {"edges": exact([-9.0, 0.0]), "m": exact([0.0]), "q": exact([0.0, 0.0])}
+    return json.dumps(data | {"proof": {"engine": "values", "stages": stages} | flat})
+
+
 _BASES |= {
     "passing": _written(passing, lower=False), "passing below": _written(passing, lower=True),
     "ending": _written(ending, lower=False), "ending below": _written(ending, lower=True),
+    "ended early": _sharp(ended_early),
 }  # fmt: skip
 
 
@@ -163,6 +199,11 @@ def _(data: Data) -> None:
 @forges("a path ends by a side beyond the domain only", "ending", "values/passage.py", "Passage._spared", "1, which is")
 def _(data: Data) -> None:
     data["problem"]["domain"][0][1] = exact(0.501)
+
+
+@forges("a path ends in any stage", "ended early", "values/passage.py", "Passage._where_spared", MORE)
+def _(data: Data) -> None:
+    _lower(data, 0.1)
 
 
 @forges("the grid lies in the domain, where a path ends", "ending below", _CROSSING, "Crossing._check_domain", "domain")

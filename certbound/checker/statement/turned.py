@@ -1,7 +1,8 @@
 """The problem in other coordinates y = T x, derived from the stated one: dY = T f(T^-1 Y) dt + T g(T^-1 Y) dW.
 
 T and its inverse are floats whose product is the identity, in fractions. A limit n . x <= b is (n T^-1) . y <= b, and
-is refused where a number of it is no float; the start is enclosed by a box, which proves upper bounds only.
+is refused where a number of it is no float, and so is constant noise; the start is enclosed by a box, which proves
+upper bounds only.
 
 Operations are sums of others with exact coefficients for as long as these are floats. What is no input stays in a sum
 with a factor of 0: it must be defined all the same.
@@ -75,7 +76,11 @@ def _ball(value: Fraction) -> arb:
 def _noise(noise: Noise, turn: Rows, back: Rows) -> Noise:
     if isinstance(noise.diffusion, Tape):
         return replace(noise, diffusion=_composed(noise.diffusion, turn, back))
-    return replace(noise, diffusion=matrix([[_ball(c) for c in row] for row in turn]) * noise.diffusion)
+    given = [[Fraction(float(x)) for x in row] for row in noise.diffusion.tolist()]
+    rows = [[sum((c * x for c, x in zip(row, column)), Fraction(0)) for column in zip(*given)] for row in turn]
+    if not all(_is_float(x) for row in rows for x in row):  # proofs take them for floats
+        raise CertificateError("`problem.noise` is not exact in the stated coordinates.")
+    return replace(noise, diffusion=matrix([[float(x) for x in row] for row in rows]))
 
 
 def _constraint(constraint: Constraint, back: Rows, moved: set[int]) -> Constraint:

@@ -136,7 +136,8 @@ class Passage:
         else:
             found = (later + v0 + self.levels.above(v0)).exp()
         found += (v0 + most).exp() * total
-        floor = arb.min(arb(stages[-1]._at_end()), arb(-_LEAST)).exp()
+        least = min([stages[-1]._at_end(), *(stage._where_spared() for stage in stages)])
+        floor = arb.min(arb(least), arb(-_LEAST)).exp()
         return arb.min((found - floor) / (1 - floor), arb(1)).upper()
 
     def paid(self, start: float) -> list[tuple[arb, arb]]:
@@ -259,11 +260,15 @@ class Passage:
         return total
 
     def _at_end(self) -> float:
-        """At most V at the horizon, and where paths end that do not fail."""
+        """At most V at the horizon."""
         n = self.model.dimension
         patches = self.surface.frozen(-1).patches(0, 1)
         low = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
-        least = min([low.min(), *(self.across(axis, -end)[0].min() for axis, end in self._spared())])
+        return float(np.nextafter(low.min() + self.lift, -np.inf))
+
+    def _where_spared(self) -> float:
+        """At most V on the sides by which a path ends that does not fail, in whatever stage it does."""
+        least = min((float(self.across(axis, -end)[0].min()) for axis, end in self._spared()), default=np.inf)
         return float(np.nextafter(least + self.lift, -np.inf))
 
     def _part(self, patches: Patches, i: int, low: Array, high: Array, which: Terms) -> Batch:

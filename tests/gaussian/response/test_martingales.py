@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -70,6 +72,25 @@ def test_every_window_costs_the_tail_of_a_reflected_brownian_motion() -> None:
     found = event.log_exceedance(np.full(6, 3.0))
     assert found == pytest.approx(np.log(2 * norm.sf(3.0) + 2 * norm.sf(6.0)), abs=1e-9)
     assert event.log_exceedance(event.level(-9.0)) <= -9.0
+
+
+def test_what_rows_lose_by_rounding_is_no_more_than_is_said() -> None:
+    """rho_{k+1} F - rho_k in fractions, for transition matrices whose products cancel."""
+    frame = Martingales(response(np.eye(2), 0.2, 20), 0, Interval(*np.full((2, 20, 2, 1), 0.5)), -9.0).frame
+    frame.transition = np.tile(np.eye(2) + 1e4 / 7 * np.array([[1, -1], [1, -1]]), (20, 1, 1))
+    for j in reversed(range(20)):
+        frame.basis[frame.inside[:, j], j] = frame.basis[frame.inside[:, j], j + 1] @ frame.transition[j]
+    frame.magnitude, frame.error = np.abs(frame.basis), np.zeros_like(frame.error)  # what is left is rounding
+    directions = np.tile([0.7, -0.3], (len(frame.ends), 1))
+    rows = np.einsum("wi,wkij->wkj", directions, frame.basis)
+    said = frame.loss(directions, rows[:, 1:])
+    missed = 0
+    for w, k, j in zip(*np.nonzero(np.repeat(frame.inside[:, :, None], 2, axis=2))):
+        moved = sum(Fraction(rows[w, k + 1, i]) * Fraction(frame.transition[k, i, j]) for i in range(2))
+        lost = abs(moved - Fraction(rows[w, k, j]))
+        assert lost <= said[w, k, j]
+        missed += lost > 0
+    assert missed
 
 
 def test_without_excess_nothing_is_exceeded() -> None:

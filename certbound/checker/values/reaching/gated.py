@@ -5,7 +5,8 @@ overlap it, from below of those whose windows cover it. At its end a path is at 
 whose windows hold that instant. V may jump there.
 
 From above, V >= min(V_next, 0) on parts of the grid that lie in the gate and in the next grid, and V >= 0 on all
-others; at the last end nothing is asked of parts in the gate. So exp(theta(V)), stopped at 1, never jumps upward.
+others; at the last end nothing is asked of parts in the gate. So exp(theta(V)), stopped at 1, never jumps upward. The
+least exp(V) where a path is over that did not fail counts over all stages: on sides beyond the domain, too.
 
 From below, V <= V_next on parts in the next grid that were not shown to be off the gate; where these lie outside of the
 next grid, and at the last end, exp(V) <= W. A path on any other part has failed, and V <= 0.
