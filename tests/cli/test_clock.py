@@ -90,7 +90,7 @@ def test_constants_fall_back_to_the_quick_ones(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slowed(monkeypatch, "certbound.constants.bounds", "bound_constants", lambda o: "metric" not in o)
-    code, found = answer(capsys, "derive", "ou", "--time-limit", "2")
+    code, found = answer(capsys, "derive", "ou", "--time-limit", "0.7")
     assert code == 0
     assert found["rate"] == -0.5
     assert found["metrics"] == []
@@ -100,7 +100,7 @@ def test_tubes_that_were_computed_are_compared(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slowed(monkeypatch, "certbound.tubes.tuning", "tune_tube", lambda o: o["method"] == "prop1")
-    code, found = answer(capsys, "tune", "ou", "--time-limit", "2.5")
+    code, found = answer(capsys, "tune", "ou", "--time-limit", "1.2")
     assert code == 0
     assert found["method"] in {row["method"] for row in found["rows"]}
     assert "prop1" not in {row["method"] for row in found["rows"]}
@@ -137,8 +137,10 @@ def test_no_paths_in_time_is_a_failure_and_some_are_an_answer(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("simulate", "ou", "--step", "0.05", "--seed", "1", "--paths", "1e12")
+    assert run([*words[:-1], "10"]) == 0  # compiles
+    capsys.readouterr()
     slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda options: options["paths"] > 2000)
-    assert answer(capsys, *words, "--time-limit", "2")[1]["paths"] == 2000
+    assert answer(capsys, *words, "--time-limit", "0.7")[1]["paths"] == 2000
     slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda _: True)
     assert run([*words, "--time-limit", "0.1"]) == 3
     assert "no paths were simulated within 0.1 s" in capsys.readouterr().err
