@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from certbound.cli import main
 from certbound.cli.app import run
 from certbound.cli.clock import Clock
 from certbound.safety.portfolio import ENGINES
@@ -229,10 +230,13 @@ def test_a_terminal_gets_colours_and_a_bar(tmp_path: Path) -> None:
     ("words", "count", "expected"),
     [("certbound ver", 1, ["verify"]), ("certbound verify un", 2, ["unicycle"]), ("certbound sim", 1, ["simulate"])],
 )
-def test_the_shell_completes_commands_and_problems(words: str, count: int, expected: list[str]) -> None:
-    environment = os.environ | {
-        "_CERTBOUND_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count),
-    }  # fmt: skip
-    code = "from certbound.cli import main; main()"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert result.stdout.split() == expected
+def test_the_shell_completes_commands_and_problems(
+    words: str, count: int, expected: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"_CERTBOUND_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count)}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "argv", ["certbound"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.split() == expected
