@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from certbound.cli import main
 from certbound.cli.app import run
 from certbound.cli.clock import Clock
 from certbound.safety.portfolio import ENGINES
@@ -90,7 +91,7 @@ def test_constants_fall_back_to_the_quick_ones(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slowed(monkeypatch, "certbound.constants.bounds", "bound_constants", lambda o: "metric" not in o)
-    code, found = answer(capsys, "derive", "ou", "--time-limit", "2")
+    code, found = answer(capsys, "derive", "ou", "--time-limit", "0.7")
     assert code == 0
     assert found["rate"] == -0.5
     assert found["metrics"] == []
@@ -100,7 +101,7 @@ def test_tubes_that_were_computed_are_compared(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slowed(monkeypatch, "certbound.tubes.tuning", "tune_tube", lambda o: o["method"] == "prop1")
-    code, found = answer(capsys, "tune", "ou", "--time-limit", "2.5")
+    code, found = answer(capsys, "tune", "ou", "--time-limit", "1.2")
     assert code == 0
     assert found["method"] in {row["method"] for row in found["rows"]}
     assert "prop1" not in {row["method"] for row in found["rows"]}
@@ -137,8 +138,10 @@ def test_no_paths_in_time_is_a_failure_and_some_are_an_answer(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("simulate", "ou", "--step", "0.05", "--seed", "1", "--paths", "1e12")
+    assert run([*words[:-1], "10"]) == 0  # compiles
+    capsys.readouterr()
     slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda options: options["paths"] > 2000)
-    assert answer(capsys, *words, "--time-limit", "2")[1]["paths"] == 2000
+    assert answer(capsys, *words, "--time-limit", "0.7")[1]["paths"] == 2000
     slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda _: True)
     assert run([*words, "--time-limit", "0.1"]) == 3
     assert "no paths were simulated within 0.1 s" in capsys.readouterr().err
@@ -227,10 +230,13 @@ def test_a_terminal_gets_colours_and_a_bar(tmp_path: Path) -> None:
     ("words", "count", "expected"),
     [("certbound ver", 1, ["verify"]), ("certbound verify un", 2, ["unicycle"]), ("certbound sim", 1, ["simulate"])],
 )
-def test_the_shell_completes_commands_and_problems(words: str, count: int, expected: list[str]) -> None:
-    environment = os.environ | {
-        "_CERTBOUND_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count),
-    }  # fmt: skip
-    code = "from certbound.cli import main; main()"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert result.stdout.split() == expected
+def test_the_shell_completes_commands_and_problems(
+    words: str, count: int, expected: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"_CERTBOUND_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count)}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "argv", ["certbound"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.split() == expected
