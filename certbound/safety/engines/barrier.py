@@ -46,6 +46,7 @@ _COARSE, _FINE = {1: 51, 2: 21, 3: 7}, {1: 201, 2: 41, 3: 9}  # points along eve
 _ROUNDS = 3
 _BINDING = 0.2  # of the many points: how many enter the program in every round
 _FAR = 1 / 3  # share of the exponent asked for, from which on the next degree is worth its time
+_WORTH = 1.15  # times the exponent known: a steady polynomial that misses the target has to hope for more than that
 _CLOSE = 0.1  # of log10: what is proved may be that far from what the program hoped for
 _BUDGET = 20_000
 _TOLERANCE = 0.02  # of kappa T, of V at the start and of V at the boundary: a loss of 0.03 in log10
@@ -93,15 +94,16 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     assert isinstance(problem.system, ContinuousSystem)
     work = _Work(problem, problem.system)
     if not lies_inside(work.gaps, work.start):
-        return EngineAnswer(
-            applicable=False, method="barrier",
-            reason="the box around the initial set was not proved to lie inside the safe set.",
-        )  # fmt: skip
-    best: Barrier | None = None
-    level = 0.0
+        outside = "the box around the initial set was not proved to lie inside the safe set."
+        return EngineAnswer(applicable=False, method="barrier", reason=outside)
+    best, level = None, 0.0
+
+    def tell(barrier: Barrier) -> None:
+        asked.found(_answer(problem, barrier))
+
     for degree in _DEGREES[work.n]:
         try:
-            found = work.search(degree, lambda barrier: asked.found(_answer(problem, barrier)), known=best is not None)
+            found = work.search(degree, tell, known=best is not None)
         except EngineError:
             if best is None:
                 raise
@@ -111,11 +113,10 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         if level <= math.log10(problem.delta) or 0 > level > _FAR * math.log10(problem.delta):
             break
     if level > math.log10(problem.delta) and work.n < _MOST_STATES:  # in three states that takes a quarter of a minute
-        found = work.steady(_DEGREES[work.n][0], lambda barrier: asked.found(_answer(problem, barrier)), level)
+        found = work.steady(_DEGREES[work.n][0], tell, level, 1.0 if asked.thorough else _WORTH)
         best = found if found is not None else best
-    if best is None:
-        return EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
-    return _answer(problem, best)
+    none = EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
+    return none if best is None else _answer(problem, best)
 
 
 def _answer(problem: Problem, best: Barrier) -> EngineAnswer:
@@ -195,7 +196,7 @@ class _Work:
                 best = proved
                 found(best)
             level = 0.0 if best is None else best.log10_probability(horizon)
-            vain = known and hoped > target
+            vain = known and (hoped > target or (number > 0 and proved is None))
             vain = vain or (self.n == _MOST_STATES and (hoped > _FAR * target or (number > 1 and proved is None)))
             if level <= target or vain or (number and level <= hoped + _CLOSE):
                 return best  # more points only raise what is hoped for, and in many states they take many seconds
@@ -210,21 +211,25 @@ class _Work:
             points = tuple(np.concatenate([have, tight]) for have, tight in zip(points, worst))  # type: ignore[assignment]  # as many as before
         return best
 
-    def steady(self, degree: int, found: Callable[[Barrier], object], level: float) -> Barrier | None:
-        """The best barrier with an inflow that proves less than ``level``, a log10; ``found`` takes what it finds."""
+    def steady(self, degree: int, found: Callable[[Barrier], object], level: float, worth: float = 1) -> Barrier | None:
+        """The best barrier with an inflow that proves less than ``level``, a log10; ``found`` takes what it finds.
+
+        It must hope for ``worth`` times that level, or the target.
+        """
         exponents, horizon, best = self._exponents(degree), float(self.problem.horizon), None
+        wanted = max(worth * level, math.log10(self.problem.delta))
         points, fine = self._points(_COARSE[self.n]), self._points(_FINE[self.n])[0]
         points, begun = (points[0], points[1], self._points(_FINE[self.n])[2]), None
         for number in range(1 + _ROUNDS):
             poll(f"a steady polynomial of degree {degree}, round {number + 1}")
             coefficients, hoped = self.programs.steadiest(exponents, points, begun)
-            if coefficients is None or hoped > level * _LOG10 - math.log(2):
+            if coefficients is None or hoped > min(wanted, level) * _LOG10 - math.log(2):
                 break
             proved, worst = self._certified(exponents, coefficients, steady=True)
             if proved is not None and proved.log10_probability(horizon) < level:
                 best, level = proved, proved.log10_probability(horizon)
                 found(best)
-            if level <= math.log10(self.problem.delta):
+            if level <= math.log10(self.problem.delta) or (number > 0 and proved is None):
                 break
             height = self.programs.generated(exponents, coefficients, fine)
             value = self.programs.monomials(exponents, fine[:, 1 : self.n + 1], ()) @ coefficients[:-1]
@@ -282,7 +287,7 @@ class _Work:
     def _certified(
         self, exponents: Integers, coefficients: Array, *, steady: bool = False
     ) -> tuple[Barrier | None, tuple[Array, Array, Array]]:
-        """What holds for the polynomial (``steady``: with an inflow), and where its three bounds are tight."""
+        """What holds for the polynomial (``steady``: with an inflow), if anything, and where its bounds are tight."""
         names = list(self.system.states)
         powers = np.vstack([exponents, np.zeros((1, self.n), dtype=np.int64)])
 
@@ -319,10 +324,11 @@ class _Work:
         inflow = 0.0
         if steady:  # of exp(V - boundary)
             inflow = float((Interval.point(max(growth.upper, 0.0)) * exp(Interval.point(exit_.upper))).hi)
-        return Barrier(
+        found = Barrier(
             exponents=powers, coefficients=coefficients, center=self.center, scale=self.scale,
             start=start.upper, boundary=-exit_.upper, growth=0.0 if steady else growth.upper, inflow=inflow,
-        ), points  # fmt: skip
+        )  # fmt: skip
+        return found if found.log10_probability(horizon) < 0 else None, points
 
     def _generator(self, value: Tape) -> Tape:
         """grad V . f + 1/2 tr(g g^T Hess V) + 1/2 |g^T grad V|^2 over (t, states, disturbances)."""

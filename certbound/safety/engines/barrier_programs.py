@@ -70,6 +70,7 @@ class Polynomials:
         coefficients, level = begun
         for left in reversed(range(_STEPS)):
             poll()
+            level = min(level, self._least(exponents, points, coefficients))  # from above tangents lead down by 1 each
             depth = np.clip(level - rows @ coefficients[:-1] - coefficients[-1], _DEEP, _HIGH)
             c, constant, m = cp.Variable(len(exponents)), cp.Variable(), cp.Variable()
             most = cp.multiply(np.exp(depth) / horizon, 1 + m - rows @ c - constant - depth)
@@ -86,6 +87,18 @@ class Polynomials:
             if abs(before - level) < _SETTLED * abs(level) or level > max(left * (before - level), 0.0) > 0:
                 break  # or it will not fall below 0 at that rate
         return coefficients, level
+
+    def _least(self, exponents: Integers, points: Points, coefficients: Array) -> float:
+        """The least m that a polynomial serves at the points; infinite where it is below 0 at the boundary."""
+        inner, initial, boundary = points
+        value, start, exit_ = (
+            self.monomials(exponents, states, ()) @ coefficients[:-1] + coefficients[-1]
+            for states in (inner[:, 1 : self.n + 1], initial, boundary)
+        )
+        grown = self.generated(exponents, coefficients, inner) * float(self.problem.horizon)
+        with np.errstate(divide="ignore"):
+            needed = value + np.log(np.maximum(grown, 0.0))
+        return max(float(start.max()), float(needed.max())) - float(exit_.min())
 
     def _first(self, exponents: Integers, points: Points) -> tuple[Array, float] | None:
         """A polynomial to begin with: high at the boundary, and of a growth that counts little."""

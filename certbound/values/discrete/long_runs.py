@@ -46,7 +46,8 @@ _LOST = 1e-3  # of the largest probability of being safe: cells with less are ro
 _SOON, _AT_LEAST, _NEGLIGIBLE = 32, 1024, 1e-17
 _BETTER = 0.9  # of the gap: what twice as many steps back have to make of it
 _DEAR, _BRIEF = 3, 2.0  # states from which on a step back is dear, and seconds at fixed rates of those that matter
-_CHECKED = 1.2  # steps back between two looks at the bounds, as a ratio
+_CHECKED, _OFTEN = 1.2, 1.04  # steps back between two looks at the bounds, as a ratio; and where looks need no rates
+_ANSWERED = 1.25  # times the ratio asked for, once the probability is low enough and steps are dear
 
 
 def _all_alike(problem: Problem) -> bool:
@@ -217,14 +218,14 @@ class _Run:
         for n in itertools.count():
             last = n >= min(ahead, most, _MOST)
             if n >= look or last:
-                look = _CHECKED * n
+                look = (_CHECKED if self.target is None else _OFTEN) * n
                 poll(f"values {n} steps back, {math.prod(grid.shape)} cells")
                 found = self._read(transition, zones, (above, below), n, share)
                 best, self.steps = found if best is None else _better(best, found), n
                 wide, twice = _gap(best), n >= 2 * gap[0]
                 vain = twice and self._stalls(best, n) and wide > _BETTER * gap[1]
                 answered = best.upper <= brief[0] and n >= brief[1]
-                if last or vain or wide <= (ratio - 1) / (1 if answered else 4):
+                if last or vain or wide <= (ratio - 1) * (_ANSWERED if answered else 0.25):
                     break
                 gap = (n, wide) if twice else gap
             above, below = back_above(transition, above, zones), back_below(transition, below, zones)

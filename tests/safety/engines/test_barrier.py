@@ -16,6 +16,7 @@ from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import problem_data
 from certbound.safety.certificates.barrier import barrier_proof
 from certbound.safety.engines import barrier as engine
+from certbound.safety.engines import barrier_programs
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.barrier_programs import Polynomials
 from certbound.safety.engines.gaps import gaps_of, lies_inside
@@ -98,12 +99,27 @@ def test_an_inflow_stays_near_the_truth_where_noise_keeps_moving() -> None:
     """Every exp(V) grows by a factor e^(kappa T) that leaves nothing over 8 units of time."""
     system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=[[0.45]])
     problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.2], [1.2]))], horizon=8, delta=1e-9)
-    found = engine._Work(problem, system).steady(4, lambda _: None, 0.0)
+    work = engine._Work(problem, system)
+    found = work.steady(4, lambda _: None, 0.0)
     assert found is not None
+    assert work.steady(4, lambda _: None, found.log10_probability(8.0), 1.15) is None  # it hopes for no more than that
     truth = bound_exits(problem, seconds=0.1)
     assert truth.lower <= found.log10_probability(8.0) <= truth.upper + np.log10(2)
     answer = barrier_engine(problem)
     assert answer.log10_delta == pytest.approx(found.log10_probability(8.0), abs=0.3)
+
+
+def test_a_steady_polynomial_takes_few_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tangents far above the level that the last polynomial serves lead down by a factor e each."""
+    asked, solved = [], barrier_programs._solved
+    monkeypatch.setattr(barrier_programs, "_solved", lambda cp, program: asked.append(1) or solved(cp, program))
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=[[0.45]])
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.2], [1.2]))], horizon=8, delta=1e-9)
+    work = engine._Work(problem, system)
+    coefficients, hoped = work.programs.steadiest(work._exponents(4), work._points(51))
+    assert coefficients is not None
+    assert hoped < 0
+    assert len(asked) <= 7
 
 
 @pytest.mark.parametrize(
