@@ -332,4 +332,31 @@ def test_a_payment_by_the_logarithm_says_nothing_of_functions_that_fall_far_belo
     start = SMALL * (0.1 - 1)
     paid = [near_walls.relative_payment(seen, flat, start, SMALL * (u - 1), 1e-9).log for u in (0.0, -0.5, -20)]
     assert math.log(0.1) - 1e-9 <= paid[0] < math.log(0.1) + 0.01
-    assert math.log(0.5) < paid[1] < 0 == paid[2]
+    assert math.log(0.4) <= paid[1] < 0 == paid[2]  # P - (1 - P) / 2 <= .1
+
+
+@pytest.mark.parametrize(
+    ("ends", "extra", "least", "most"),
+    [  # what paths can gain in all: from .03 they may come to where U is low or where it is high
+        ([(0.0, 0.1), (0.1, 0.2)], [0.001, 0.02], 0.036, 0.04),  # 1 by the logarithm of U alone
+        ([(0.2, 0.3)], [0.02], 0.033, 0.034),
+        ([(0.99, 1.01)], [0.02], 0.03, 0.031),  # U is lifted over 1
+    ],
+)
+def test_residuals_where_u_is_low_are_paid_in_absolute_terms(
+    ends: list[tuple[float, float]], extra: list[float], least: float, most: float
+) -> None:
+    count = 5
+    low, high = (SMALL * (np.tile([pair[k] for pair in ends], count) - 1) for k in (0, 1))
+    none = np.zeros(len(low))
+    ranges = Ranges(
+        residual_low=none, residual_high=SMALL * np.tile(extra, count), low=low, high=high, energy=none
+    )  # fmt: skip
+    seen = Proof(ranges=ranges, slab=np.repeat(np.arange(count), len(ends)), cell=none.astype(int))
+    still = np.zeros((count + 1, 2, 3, 2, 3))
+    flat = Surface(
+        axes=(np.array([0.0, 1.0]),) * 2, times=np.linspace(0, 1, count + 1), values=still, start_rates=still[:-1],
+        end_rates=still[:-1],
+    )  # fmt: skip
+    paid = near_walls.relative_payment(seen, flat, SMALL * (0.03 - 1), -SMALL, 1e-9)
+    assert least <= math.exp(paid.log) < most

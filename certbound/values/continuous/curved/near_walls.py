@@ -34,8 +34,8 @@ _SAMPLES = (4, 6, 6)
 _FACTORS = (0.6, 0.9, 1.12, 1.12, 1.12)  # of what a proof would pay, for one source after the other
 _SAMPLED = 3  # of which samples tell, and its bounds after that
 _HOPELESS = 3.0  # of log P: where samples say that a proof would lose more, none is tried
-_TOP = -0.1  # of log U: where it is above, the proof may lift it over 0 instead
-_SHIFT = 2e-3  # of P, added to U where its logarithm is looked at
+_TOP = -0.003  # of log U: where it is above, the proof may lift it over 0 instead
+_SHIFTS = (2e-3, 0.03, 0.1, 0.3, 1.0, 3.0)  # of P, added to U where its logarithm is looked at, in turn
 _ROUNDED = 1e-15  # more than 1 + V / e is off by
 _GRANTED = 0.005  # of the answer, which the proof may pay in any case
 
@@ -123,27 +123,36 @@ class _Sketch:
 
 
 def relative_payment(proof: Proof, surface: Surface, start: float, floor: float, spare: float) -> Payment:
-    """The theorem's upper bound with log(U + c) in place of V, from what was seen of V = e (U - 1).
+    """The theorem's upper bound with log((U + c) / (1 + c)) in place of V, from what was seen of V = e (U - 1).
 
     (U + c)_t + L (U + c) is at most R / e, since Q2 >= 0: so R of the logarithm is at most R / (e (U + c)), which is
-    less where U is large, and where U + c is above 1 nothing is asked. ``start`` bounds V over the starts from above,
+    less where U is large, and where the logarithm is above 0, as on walls, nothing is asked. The best of some c is
+    taken: with large ones U is paid for in absolute terms. ``start`` bounds V over the starts from above,
     ``floor`` everywhere from below; where nothing was looked at, R is at most ``spare`` (1 + exp(start - V)), which is
     less than 2.1 ``spare``.
     """
     value, least = 1 + start / SMALL + _ROUNDED, 1 + floor / SMALL - _ROUNDED
     if not (0 < value < 1 and least > -10):
         return Payment(log=0.0)
-    shift = max(0.0, -least) + _SHIFT * value
+    paid = [_paid_with(proof, surface, (value, least, max(0.0, -least) + c * value), spare) for c in _SHIFTS]
+    return min(paid, key=lambda one: one.log)
+
+
+def _paid_with(proof: Proof, surface: Surface, ends: tuple[float, float, float], spare: float) -> Payment:
+    """The same with one c, from U at the starts, the least U, and c."""
+    value, least, shift = ends
+    walls = math.log1p(shift) * (1 - 1e-15)  # at most log (1 + c)
     low = (1 + proof.ranges.low / SMALL - _ROUNDED + shift) * (1 - 1e-12)
     high = (1 + proof.ranges.high / SMALL + _ROUNDED + shift) * (1 + 1e-12)
     low = np.maximum(low, (least + shift) * (1 - 1e-12))
-    begun = math.log((value + shift) * (1 + 1e-12)) + 1e-14
+    begun = math.log((value + shift) * (1 + 1e-12)) - walls + 1e-14
     excess = np.maximum(proof.ranges.residual_high / SMALL / low * (1 + 1e-12), 0.0)
     none = np.zeros(len(low))
     ranges = Ranges(
-        residual_low=none, residual_high=excess, low=np.log(low) - 1e-14, high=np.log(high) + 1e-14, energy=none
-    )
+        residual_low=none, residual_high=excess, low=np.log(low) - walls - 1e-14, high=np.log(high) - walls + 1e-14,
+        energy=none,
+    )  # fmt: skip
     need = Need(spare=2.1 * spare / SMALL / (value + shift), start=begun, top=0.0)
-    end = math.log((least + shift) * (1 - 1e-12)) - 1e-14
+    end = math.log((least + shift) * (1 - 1e-12)) - walls - 1e-14
     payment, lift = cheapest(replace(proof, ranges=ranges), need, surface, begun, end)
     return replace(payment, lift=lift)

@@ -27,6 +27,7 @@ _ON_WALL = 3.0  # the weight of U = 1 on the walls, that of the equation being a
 _AGE = 0.8  # of a ramp, in units of a cell's width squared over the noise's variance
 _LAYER, _ZONE = 1.5, 2.0  # widths of layers at faces, and of where the drift is weakened, in cells
 _SMOOTH = 1e-3  # of third differences of coefficients outside
+_SYMMETRIC = {"SymmetricMode": True}  # normal equations need no pivots, so that their order may keep them sparse
 
 
 class WalledRamps(Ramps):
@@ -90,7 +91,7 @@ class WalledRamps(Ramps):
         free = np.setdiff1d(np.arange(whole.shape[1]), self.edge)
         own, given = whole[:, free], whole[:, self.edge]
         back = csr_matrix(own.conj().T)
-        normal = splu(csc_matrix(back @ own))
+        normal = splu(csc_matrix(back @ own), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_SYMMETRIC)
         count = len(self.edge)
 
         def solve(right: Array) -> Array:
