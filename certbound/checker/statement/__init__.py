@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from certbound.checker.statement.by_ito import logarithmic_model
 from certbound.checker.statement.comparison import first_difference
 from certbound.checker.statement.drawn import weights_of
 from certbound.checker.statement.partition import cells_of, starts_of
@@ -18,6 +19,7 @@ __all__ = [
     "demands",
     "first_difference",
     "Grid",
+    "logarithmic_model",
     "met_at",
     "Model",
     "read_model",

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         undefined_where,
     )
     from certbound.problem.model.recombined import turned_tape
+    from certbound.problem.model.relative_rates import in_logarithms, proportional
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.time_jumps import between_jumps, cut_at_jumps
     from certbound.problem.model.tracing import trace
@@ -49,6 +50,7 @@ _HOME = {
     "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
     "recombined": "turned_tape",
+    "relative_rates": "in_logarithms proportional",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "time_jumps": "between_jumps cut_at_jumps",
@@ -68,6 +70,7 @@ __all__ = [
     "edged",
     "enclosed",
     "Graph",
+    "in_logarithms",
     "is_zero",
     "jacobian",
     "JUMPS",
@@ -80,6 +83,7 @@ __all__ = [
     "OPERATIONS",
     "Part",
     "PARTS",
+    "proportional",
     "relaxed",
     "ROWS",
     "selected",

@@ -32,7 +32,7 @@ def scales_of(problem: Problem) -> Array | None:
     The covariance along the dynamics at the middle of the starts, whose norm is that of balanced states.
     """
     system, n = problem.system, problem.system.dimension
-    if not isinstance(system, ContinuousSystem) or not _is_plain(problem) or not np.isfinite(problem.horizon):
+    if not isinstance(system, ContinuousSystem) or not is_plain(problem) or not np.isfinite(problem.horizon):
         return None
     hull = problem.initial.hull()
     place = [np.float64(value) for value in (0.0, *(hull.lo + hull.hi) / 2)]
@@ -69,7 +69,7 @@ def scales_of(problem: Problem) -> Array | None:
     return np.asarray(np.clip(np.round(np.log2(extent)), -900, 900).astype(int))
 
 
-def _is_plain(problem: Problem) -> bool:
+def is_plain(problem: Problem) -> bool:
     """Whether it has one set of starts, limits and a model that follows the state at once, and nothing else."""
     drawn = problem.ending or problem.initial.random or problem.random
     return not drawn and len(problem.starts) == 1 and problem.hold is None and problem.reach is None
@@ -118,7 +118,7 @@ def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
     system, n = problem.system, problem.system.dimension
     if not np.array_equal(exact_product(matrix, inverse), np.eye(n)):
         raise InfeasibleError("the matrices of other coordinates must be inverse to each other.")
-    if not isinstance(system, ContinuousSystem) or not _is_plain(problem):
+    if not isinstance(system, ContinuousSystem) or not is_plain(problem):
         raise InfeasibleError("other coordinates serve plain problems in continuous time.")
     moved = {j for j in range(n) if np.any(inverse[j] != np.eye(n)[j])}
     if problem.domain is not None and any(np.isfinite([problem.domain.low[j], problem.domain.high[j]]).any()
