@@ -1,10 +1,10 @@
 """The problem in logarithms of some states, derived from the stated one by Ito's formula.
 
 Where x_i = exp(y_i) > 0, dY_i = (f_i/x_i - 1/2 sum_k (g_ik/x_i)^2) dt + sum_k (g_ik/x_i) dW_k. A limit that lasts keeps
-x_i positive: until one is broken Y_i = log X_i is defined, and the same paths break a limit of x_i and its image. Images
-are rounded such that less is safe, and starts outward, which proves upper bounds only.
+x_i positive: until one is broken Y_i = log X_i is defined, and the same paths break a limit of x_i and its image.
+Images are rounded such that less is safe, and starts outward, which proves upper bounds only.
 
-What x_i divides is written without it wherever it is a factor, over the reals: what remains must be defined all the same.
+What x_i divides is written without it wherever it is a factor, over the reals: what remains must be defined as before.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from flint import arb, fmpq
+from flint import arb, arb_mat, fmpq
 
 from certbound.checker.balls import matrix
 from certbound.checker.reading import Record, wholes
-from certbound.checker.statement.problem import Initial, Model, Noise
+from certbound.checker.statement.problem import Initial, Model
 from certbound.checker.statement.regions import Constraint
 from certbound.errors import CertificateError
-from certbound.problem.model import Node, Tape, needed
+from certbound.problem.model import Node, Tape
 
 _MOST = 40  # states
 _LONGEST = 20_000  # operations
@@ -38,12 +38,13 @@ def logarithmic_model(model: Model, record: Record) -> Model:
     plain = model.continuous and model.hold is None and model.target is None and model.domain is None
     if not plain or model.ends or random or not isinstance(model.noise.diffusion, Tape) or n > _MOST:
         raise CertificateError(f"`{record.path}.engine` must not be \"logarithms\" for such a problem.")
+    place = f"`{record.at('states')}`"
     chosen = sorted(set(wholes(record["states"], record.at("states"), 0, n - 1)))
     if not chosen or len(model.dynamics.nodes) + len(model.noise.diffusion.nodes) > _LONGEST:
-        raise CertificateError(f"`{record.at('states')}` must name states, of a model of at most {_LONGEST} operations.")
+        raise CertificateError(f"{place} must name states, of a model of at most {_LONGEST} operations.")
     for i in chosen:
         if not any(_keeps_positive(one, i) for one in model.constraints):
-            raise CertificateError(f"`{record.at('states')}` must name states that a limit for all time keeps positive.")
+            raise CertificateError(f"{place} must name states that a limit for all time keeps positive.")
     dynamics, noise = _derived(model.dynamics, model.noise.diffusion, chosen)
     return replace(
         model, dynamics=dynamics, noise=replace(model.noise, diffusion=noise), by_ito=True,
@@ -77,7 +78,7 @@ def _constraint(constraint: Constraint, chosen: Sequence[int]) -> Constraint:
     region = constraint.region
     if not set(chosen) & set(region.coordinates):
         return constraint
-    if region.kind == "halfspace" or not region.round:
+    if not region.round:
         touched = [place for face in region.faces for place, c in zip(region.coordinates, face) if c]
         if not set(chosen) & set(touched):
             return constraint
@@ -96,19 +97,19 @@ def _constraint(constraint: Constraint, chosen: Sequence[int]) -> Constraint:
         sign = 1.0 if face[own[0]] > 0 else -1.0
         faces.append([sign if k == own[0] else 0.0 for k in range(len(face))])
         image = end.log() * sign
-        bounds.append(-_float(-image, up=True) if constraint.inside else _float(image, up=True))
+        bounds.append(-_above(-image) if constraint.inside else _above(image))
     return replace(constraint, region=replace(region, faces=faces, bounds=bounds))
 
 
-def _float(value: arb, *, up: bool) -> float:
+def _above(value: arb) -> float:
     """A float that is at least the ball."""
     found = float(value.upper())
-    while up and arb(found) < value.upper():
+    while arb(found) < value.upper():
         found = math.nextafter(found, math.inf)
     return found
 
 
-def _derived(dynamics: Tape, diffusion: Tape, chosen: Sequence[int]) -> tuple[Tape, Noise | object]:
+def _derived(dynamics: Tape, diffusion: Tape, chosen: Sequence[int]) -> tuple[Tape, arb_mat | Tape]:
     """The rates and what multiplies the noise; the latter is a matrix where no entry depends on anything."""
     n, m = diffusion.shape
     writer = _Writer(len(dynamics.inputs))
@@ -134,7 +135,7 @@ def _exponentials(
     shape: tuple[int, ...],
 ) -> Tape:
     """The operations that are needed, with exp(y_i) where x_i stands."""
-    kept, places, found = needed(nodes, outputs), dict[int, int](), list[Node]()
+    kept, places, found = _asked(nodes, outputs), dict[int, int](), list[Node]()
     for index, node in enumerate(nodes):
         if kept[index]:
             found.append(node if node.op == "input" else node._replace(args=tuple(places[arg] for arg in node.args)))
@@ -142,6 +143,18 @@ def _exponentials(
                 found.append(Node("exp", (len(found) - 1,)))
             places[index] = len(found) - 1
     return Tape(inputs=inputs, nodes=tuple(found), outputs=tuple(places[k] for k in outputs), shape=shape)
+
+
+def _asked(nodes: Sequence[Node], outputs: Sequence[int]) -> list[bool]:
+    """Whether each operation is an output or what one depends on."""
+    found = [False] * len(nodes)
+    for output in outputs:
+        found[output] = True
+    for index in range(len(nodes) - 1, -1, -1):
+        if found[index] and nodes[index].op != "input":
+            for arg in nodes[index].args:
+                found[arg] = True
+    return found
 
 
 class _Writer:
@@ -199,7 +212,7 @@ class _Writer:
 
     def quotients(self, slot: int, wanted: Sequence[int]) -> list[int]:
         """The wanted operations divided by an input: without a division where it is a factor, of sums term by term."""
-        x, kept = self.inputs[slot], needed(self.nodes, wanted)
+        x, kept = self.inputs[slot], _asked(self.nodes, wanted)
         factors: dict[int, int] = {x: self.const(Fraction(1))}
         found: dict[int, int] = {}
         for index in [place for place, asked in enumerate(kept) if asked]:

@@ -35,8 +35,7 @@ if TYPE_CHECKING:
         kinks_where,
         undefined_where,
     )
-    from certbound.problem.model.recombined import turned_tape
-    from certbound.problem.model.relative_rates import in_logarithms, proportional
+    from certbound.problem.model.recombined import in_logarithms, turned_tape
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.time_jumps import between_jumps, cut_at_jumps
     from certbound.problem.model.tracing import trace
@@ -49,8 +48,7 @@ _HOME = {
     "calling": "call_network",
     "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
-    "recombined": "turned_tape",
-    "relative_rates": "in_logarithms proportional",
+    "recombined": "in_logarithms turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "time_jumps": "between_jumps cut_at_jumps",
@@ -83,7 +81,6 @@ __all__ = [
     "OPERATIONS",
     "Part",
     "PARTS",
-    "proportional",
     "relaxed",
     "ROWS",
     "selected",
