@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -130,12 +131,7 @@ def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
     if problem.domain is not None and any(np.isfinite([problem.domain.low[j], problem.domain.high[j]]).any()
                                           for j in moved):  # fmt: skip
         raise InfeasibleError("the domain bounds a state that other coordinates replace.")
-    law = isinstance(problem.plan, Tape)
-    signals: dict[str, Any] = {}
-    if system.inputs is not None and not law:
-        signals |= {"inputs": system.inputs, "input_names": system.input_names}
-    if system.disturbance is not None:
-        signals |= {"disturbance": system.disturbance, "disturbance_names": system.disturbance_names}
+    law, signals = isinstance(problem.plan, Tape), _signals(problem)
     turned = ContinuousSystem(
         turned_tape(problem.closed_loop, inverse, matrix)[0], states=system.states,
         diffusion=_diffusion(system.diffusion, matrix, inverse), **signals,
@@ -146,6 +142,16 @@ def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
         return problem.replace(system=turned, initial=start, safe=safe, plan=plan, cost=None, units=None)
     except ValueError as error:
         raise InfeasibleError(f"a box around the starts in other coordinates is too large: {error}") from error
+
+
+def _signals(problem: Problem) -> dict[str, Any]:
+    """The inputs that no law replaces, and the disturbances."""
+    system, found = problem.system, dict[str, Any]()
+    if system.inputs is not None and not isinstance(problem.plan, Tape):
+        found |= {"inputs": system.inputs, "input_names": system.input_names}
+    if system.disturbance is not None:
+        found |= {"disturbance": system.disturbance, "disturbance_names": system.disturbance_names}
+    return found
 
 
 def _diffusion(diffusion: Array | Tape, matrix: Array, inverse: Array) -> Array | Tape:
@@ -219,11 +225,7 @@ def logarithmic(problem: Problem) -> tuple[tuple[int, ...], Problem] | None:
         return None
     places, dynamics, diffusion = found
     law = isinstance(problem.plan, Tape)
-    signals: dict[str, Any] = {}
-    if system.inputs is not None and not law:
-        signals |= {"inputs": system.inputs, "input_names": system.input_names}
-    if system.disturbance is not None:
-        signals |= {"disturbance": system.disturbance, "disturbance_names": system.disturbance_names}
+    names, signals = tuple(f"log_{x}" if i in places else x for i, x in enumerate(system.states)), _signals(problem)
     given: Array | Tape = diffusion
     constants = [diffusion.nodes[output] for output in diffusion.outputs]
     if all(node.op == "const" for node in constants):
@@ -231,7 +233,10 @@ def logarithmic(problem: Problem) -> tuple[tuple[int, ...], Problem] | None:
     elif all(node.op != "input" for node in diffusion.nodes):
         raise InfeasibleError("the noise is constant in logarithms, which is not stated so.")
     try:
-        turned = ContinuousSystem(dynamics, states=system.states, diffusion=given, **signals)
+        turned = ContinuousSystem(
+            replace(dynamics, inputs=("t", *names, *dynamics.inputs[n + 1 :])), states=names,
+            diffusion=replace(given, inputs=("t", *names)) if isinstance(given, Tape) else given, **signals,
+        )  # fmt: skip
         return places, problem.replace(
             system=turned, initial=_start_by(problem, places), safe=[_image(one, places, n) for one in problem.safe],
             plan=None if law else problem.plan, cost=None, units=None,
