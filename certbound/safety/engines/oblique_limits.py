@@ -34,6 +34,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
 from certbound.safety.engines.rooms import log10_sum
 from certbound.safety.engines.turning import exact_product, logarithmic, scales_of, turned_problem
+from certbound.watch import OutOfTime, seconds_left, share_of_time
 
 Prove = Callable[[Problem, Request], EngineAnswer]
 Turn = tuple[Array, Array]
@@ -45,6 +46,7 @@ _MOST = 20  # states
 _LONGEST = 4000  # operations of a model that is looked through for sums
 _UNLIKE = 5  # the logarithm to the base 2 of states' ratio from which they are asked in other units, too
 _FAR = 12  # and first
+_HALF = 0.5  # of the time that is left, for logarithms
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -317,8 +319,13 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
         earlier = before and before.answer.details
         inner = replace(asked, before=earlier, found=lambda answer: asked.found(stated(answer)))
         found: EngineAnswer | None = None
-        with contextlib.suppress(InfeasibleError, EnclosureError):
-            found = prove(turned, inner)
+        ended, left = True, seconds_left()
+        with share_of_time(_HALF):
+            with contextlib.suppress(InfeasibleError, EnclosureError):
+                found = prove(turned, inner)
+            ended = False
+        if ended and seconds_left() > (1 - _HALF) * left:
+            raise OutOfTime  # another engine has answered meanwhile
         useful = found is not None and found.applicable and found.certified and found.log10_delta < 0
         if found is not None and useful:
             if is_at_most(found.log10_delta, problem.delta):
