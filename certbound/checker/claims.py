@@ -27,7 +27,7 @@ from certbound.checker.endless import (
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number, wholes
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model, met_at, turned_model, weights_of
+from certbound.checker.statement import Model, met_at, restated, weights_of
 from certbound.checker.time_pieces import jumps_of, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
 from certbound.errors import CertificateError
@@ -42,8 +42,8 @@ RANDOM = "random"
 REACH = "reach"
 """The engine that a proof names where the problem has a target: it meets the target at one time."""
 
-COORDINATES = "coordinates"
-"""The engine that a proof names whose own proof is about the problem in other coordinates."""
+OTHER_STATES = ("coordinates", "logarithms")
+"""The engines that a proof names whose own proof is about the problem in other coordinates, or in logarithms."""
 
 LIMITS = "limits"
 """The engine that a proof names whose parts are about some of the constraints each, and add up."""
@@ -93,7 +93,7 @@ class Engine:
 
 def engine_of(proof: object, method: str) -> str:
     """The engine that a proof names, which ``claim.method`` must name too."""
-    engine = _named(proof, "proof", (*ENGINES, UNION, RANDOM, REACH, COORDINATES, LIMITS))
+    engine = _named(proof, "proof", (*ENGINES, UNION, RANDOM, REACH, *OTHER_STATES, LIMITS))
     if method != engine:
         raise CertificateError(f"`claim.method` must be \"{engine}\", the proof's engine, got {quoted(method)}.")
     return engine
@@ -160,9 +160,7 @@ def _plain_parts(
         yield from _plain_parts(met_at(model, record.number("time")), record["proof"], f"{path}.proof")
     else:
         known = tuple(name for name, row in ENGINES.items() if model.hold is None or row.holds)
-        if _is(proof, COORDINATES):
-            record = Record(proof, path, ("engine", "matrix", "inverse", "proof"))
-            model, proof, path = turned_model(model, record), record["proof"], f"{path}.proof"
+        model, proof, path = restated(model, proof, path)
         yield _named(proof, path, known), model, proof  # type: ignore[misc]  # a mapping: it names an engine
 
 
@@ -221,7 +219,7 @@ def check_side(model: Model, proof: object, lower: bool) -> None:
         raise CertificateError("`claim.log10_lower` must not be there for an unknown constant, which does not react.")
     if lower and (model.members or model.drawn):
         raise CertificateError("`claim.log10_lower` must not be there for a union of starts.")
-    if lower and _is(proof, COORDINATES):
+    if lower and any(_is(proof, engine) for engine in OTHER_STATES):
         raise CertificateError("`claim.log10_lower` must not be there in other coordinates, where starts are enclosed.")
     if lower and _is(proof, LIMITS):
         raise CertificateError("`claim.log10_lower` must not be there where limits are taken apart.")
@@ -289,7 +287,7 @@ def assumptions(model: Model, proof: Mapping[str, object], named: Sequence[str])
 
 def _additive(model: Model) -> bool:
     """The linear response bounds a Gaussian process that no disturbance moves, and all else path by path."""
-    return not isinstance(model.noise.diffusion, Tape)
+    return not isinstance(model.noise.diffusion, Tape) and not model.by_ito
 
 
 def _stated(model: Model, proof: Mapping[str, object]) -> str | None:

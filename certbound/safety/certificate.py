@@ -28,7 +28,8 @@ from certbound.safety.portfolio import ENGINES
 
 FORMAT = "certbound certificate"
 VERSION = 1
-_OTHERS = ("reach", "coordinates", "limits", "lasting", "rate", "drift", "surely")  # proofs not called as their engine
+_OTHERS = ("reach", "coordinates", "logarithms", "limits", "lasting", "rate", "drift", "surely")
+"""Proofs that are not called as their engine."""
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
 
 def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -> str:

@@ -24,6 +24,7 @@ from certbound.safety.certificates import (
 )
 from certbound.safety.engines import (
     barrier_engine,
+    by_logarithms,
     constants_engine,
     in_coordinates,
     linear_chance,
@@ -113,7 +114,7 @@ ENGINES: dict[str, Engine] = {
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states",
-            prove=in_coordinates(linear_engine),
+            prove=by_logarithms(in_coordinates(linear_engine), again=True),
             write=of_coordinates(response_proof),
             again=True,
             chance=linear_chance,
@@ -133,8 +134,8 @@ ENGINES: dict[str, Engine] = {
             name="barrier",
             words="the exponential of a polynomial that grows slowly in the mean (continuous time, few states)",
             when="while nothing else has proved SAFE",
-            prove=barrier_engine,
-            write=barrier_proof,
+            prove=by_logarithms(barrier_engine),
+            write=of_coordinates(barrier_proof),
             reserve=True,
             chance=_polynomials,
         ),
@@ -144,7 +145,7 @@ ENGINES: dict[str, Engine] = {
             "time, up to twelve states)",
             when="while nothing else has proved SAFE; says most in three to ten states where the noise is too "
             "large for a linearisation",
-            prove=in_coordinates(quadratic_engine),
+            prove=by_logarithms(in_coordinates(quadratic_engine)),
             write=of_coordinates(quadratic_proof),
             reserve=True,
             refines=True,
@@ -157,7 +158,7 @@ ENGINES: dict[str, Engine] = {
             words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
             when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
             "UNSAFE",
-            prove=in_coordinates(values_engine, beside=barrier_engine),
+            prove=by_logarithms(in_coordinates(values_engine, beside=barrier_engine)),
             write=of_coordinates(values_proof, beside=barrier_proof),
             write_below=of_coordinates(values_proof_below, below=True),
             reserve=True,

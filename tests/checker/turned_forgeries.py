@@ -10,11 +10,12 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.safety.answers import exact
 from certbound.safety.certificate import certificate_text, restated
-from certbound.safety.engines import Apart, Turned, linear_engine
+from certbound.safety.engines import Apart, Logarithmic, Turned, linear_engine
 from certbound.safety.engines.oblique_limits import axes
-from certbound.safety.engines.turning import turned_problem
+from certbound.safety.engines.turning import logarithmic, turned_problem
 from certbound.safety.verdict import verdict_of
 from tests.checker.forgeries import _BASES, BEYOND, MORE, Data, forges
+from tests.safety.engines.test_logarithms import prices
 from tests.safety.engines.test_oblique_limits import oblique
 
 _TURNED = "statement/turned.py"
@@ -102,5 +103,59 @@ def _(data: Data) -> None:
 
 
 @forges("limits that are taken apart prove no lower bound", "apart", "claims.py", "check_side", "taken apart")
+def _(data: Data) -> None:
+    data["claim"] |= {"log10_delta": exact(0.0), "log10_lower": data["claim"]["log10_delta"]}
+
+
+_LOGS = "statement/by_ito.py"
+
+
+def logarithms_text() -> str:
+    """The certificate of a price by a linear response in its logarithm."""
+    problem = prices()
+    places, other = logarithmic(problem) or ((), problem)
+    answer = linear_engine(other)
+    found = Logarithmic(places=places, problem=other, answer=answer, plain=answer)
+    return certificate_text(problem, verdict_of(problem, {"linear": replace(answer, details=found, foresight=False)}))
+
+
+_BASES |= {"logarithms": logarithms_text}
+
+
+@forges("what has a logarithm stays positive", "logarithms", _LOGS, "logarithmic_model", "keeps positive")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["during"] = exact([0.0, 0.5])
+
+
+@forges("a limit is one of a single state in logarithms", "logarithms", _LOGS, "_constraint", "no positive one")
+def _(data: Data) -> None:
+    data["problem"]["constraints"][1]["region"]["normal"] = exact([-1.0])
+
+
+@forges("a limit is the stated one in logarithms", "logarithms", _LOGS, "_constraint", BEYOND)
+def _(data: Data) -> None:
+    data["problem"]["constraints"][0]["region"]["high"] = exact([1.75])
+
+
+@forges("the dynamics is the stated one in logarithms", "logarithms", _LOGS, "_derived", "remainder of")
+def _(data: Data) -> None:
+    tape = data["problem"]["dynamics"]
+    tape["nodes"] += [["const", exact(4.0)], ["mul", tape["outputs"][0], len(tape["nodes"])]]
+    tape["outputs"][0] = len(tape["nodes"]) - 1
+
+
+@forges("the noise is the stated one in logarithms", "logarithms", _LOGS, "_derived", "remainder of")
+def _(data: Data) -> None:
+    tape = data["problem"]["noise"]["diffusion"]
+    tape["nodes"] += [["const", exact(2.0)], ["mul", tape["outputs"][0], len(tape["nodes"])]]
+    tape["outputs"][0] = len(tape["nodes"]) - 1
+
+
+@forges("the starts are those of the logarithms", "logarithms", _LOGS, "_start", "cover|splits|initial")
+def _(data: Data) -> None:
+    data["problem"]["initial"] |= {"low": exact([1.25]), "high": exact([1.25])}
+
+
+@forges("logarithms prove no lower bound", "logarithms", "claims.py", "check_side", "in other coordinates")
 def _(data: Data) -> None:
     data["claim"] |= {"log10_delta": exact(0.0), "log10_lower": data["claim"]["log10_delta"]}

@@ -10,7 +10,7 @@ from certbound.checker.statement.regions import Constraint
 from certbound.checker.statement.rooms import Grid, demands, round_demands
 from certbound.checker.statement.safe_set import SafeSet, StepSet
 from certbound.checker.statement.structure import Structure, structure_of
-from certbound.checker.statement.turned import turned_model
+from certbound.checker.statement.turned import restated
 
 __all__ = [
     "cells_of",
@@ -21,12 +21,12 @@ __all__ = [
     "met_at",
     "Model",
     "read_model",
+    "restated",
     "round_demands",
     "SafeSet",
     "starts_of",
     "StepSet",
     "Structure",
     "structure_of",
-    "turned_model",
     "weights_of",
 ]

@@ -112,6 +112,7 @@ class Model:
     ends: bool = False  # where the domain is left: that is no failure, and counting it as one bounds from above only
     drawn: tuple[Drawn, ...] = ()  # constants, over whose values the probability is an average
     hold: Hold | None = None  # then the inputs of the dynamics are what its law said last
+    by_ito: bool = False  # derived by Ito's formula: no disturbance sees coming noise then
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property

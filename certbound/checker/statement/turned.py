@@ -10,7 +10,7 @@ with a factor of 0: it must be defined all the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -18,6 +18,7 @@ from flint import arb
 
 from certbound.checker.balls import matrix
 from certbound.checker.reading import Record
+from certbound.checker.statement.by_ito import logarithmic_model
 from certbound.checker.statement.problem import Initial, Model, Noise
 from certbound.checker.statement.regions import Constraint
 from certbound.errors import CertificateError
@@ -30,6 +31,17 @@ _TERMS = 64
 Rows = list[list[Fraction]]
 Sum = tuple[dict[int, Fraction], Fraction]
 """Coefficients of operations, and a constant: floats, all of them."""
+
+
+def restated(model: Model, proof: object, path: str) -> tuple[Model, object, str]:
+    """The model that a proof is about, that proof, and where it stands: in logarithms first, then in coordinates."""
+    for engine, fields, derive in (
+        ("logarithms", ("states",), logarithmic_model), ("coordinates", ("matrix", "inverse"), turned_model)
+    ):  # fmt: skip
+        if isinstance(proof, Mapping) and proof.get("engine") == engine:
+            record = Record(proof, path, ("engine", *fields, "proof"))
+            model, proof, path = derive(model, record), record["proof"], f"{path}.proof"
+    return model, proof, path
 
 
 def turned_model(model: Model, record: Record) -> Model:

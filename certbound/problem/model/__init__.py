@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         kinks_where,
         undefined_where,
     )
-    from certbound.problem.model.recombined import turned_tape
+    from certbound.problem.model.recombined import in_logarithms, turned_tape
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.time_jumps import between_jumps, cut_at_jumps
     from certbound.problem.model.tracing import trace
@@ -48,7 +48,7 @@ _HOME = {
     "calling": "call_network",
     "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
-    "recombined": "turned_tape",
+    "recombined": "in_logarithms turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "time_jumps": "between_jumps cut_at_jumps",
@@ -68,6 +68,7 @@ __all__ = [
     "edged",
     "enclosed",
     "Graph",
+    "in_logarithms",
     "is_zero",
     "jacobian",
     "JUMPS",

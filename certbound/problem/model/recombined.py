@@ -2,11 +2,14 @@
 
 Every value is a sum of operations with exact coefficients for as long as these are floats; where they are not, its
 parts are added as they stand. Interval arithmetic would not see that p2 - (p2 - a) is a.
+
+In logarithms of states, x_i = exp(y_i), what a state divides is divided as far as it goes: dx_i = f_i dt
++ sum_k g_ik dW_k becomes dy_i = (f_i/x_i - 1/2 sum_k (g_ik/x_i)^2) dt + sum_k (g_ik/x_i) dW_k (Ito, x_i > 0).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -146,3 +149,109 @@ def _is_float(value: Fraction) -> bool:
         return Fraction(float(value)) == value
     except OverflowError:
         return False
+
+
+class _Quotients:
+    """What values of a graph are once one of its inputs has divided them."""
+
+    def __init__(self, graph: Graph, x: int) -> None:
+        self.graph, self.x = graph, x
+        self._factors: dict[int, int | None] = {x: graph.const(1.0)}
+        self._found: dict[int, int] = {}
+
+    def factor(self, node: int) -> int | None:
+        """node / x without a division; None where x is no factor of it."""
+        if node not in self._factors:
+            self._factors[node] = self._factor(node)
+        return self._factors[node]
+
+    def _factor(self, node: int) -> int | None:
+        graph, (op, args, value, _) = self.graph, self.graph.nodes[node]
+        if op == "const" and value == 0:
+            return node
+        if op == "mul":
+            for a, b in (args, args[::-1]):
+                found = self.factor(a)
+                if found is not None:
+                    return graph.apply("mul", found, b)
+        elif op in ("div", "neg"):
+            found = self.factor(args[0])
+            return None if found is None else graph.apply(op, found, *args[1:])
+        elif op in ("add", "sub"):
+            found, other = self.factor(args[0]), self.factor(args[1])
+            return None if found is None or other is None else graph.apply(op, found, other)
+        elif op == "sq":
+            found = self.factor(args[0])
+            return None if found is None else graph.apply("mul", found, args[0])
+        elif op == "pow" and args[0] == self.x and value > 1:
+            return graph.pow(self.x, value - 1) if value - 1 == int(value) - 1 else None
+        return None
+
+    def of(self, node: int) -> int:
+        """node / x: of a sum term by term."""
+        if node not in self._found:
+            self._found[node] = self._of(node)
+        return self._found[node]
+
+    def _of(self, node: int) -> int:
+        graph, (op, args, *_) = self.graph, self.graph.nodes[node]
+        found = self.factor(node)
+        if found is not None:
+            return found
+        if op in ("add", "sub"):
+            return graph.apply(op, self.of(args[0]), self.of(args[1]))
+        if op == "neg":
+            return graph.apply("neg", self.of(args[0]))
+        for a, b in (args, args[::-1]) if op == "mul" else ():
+            if graph.number(a) is not None:
+                return graph.apply("mul", a, self.of(b))
+        return graph.apply("div", node, self.x)
+
+
+def in_logarithms(
+    dynamics: Tape, diffusion: Tape, allowed: Collection[int]
+) -> tuple[tuple[int, ...], Tape, Tape] | None:
+    """A model in the logarithms of those of the ``allowed`` states whose noise has the state as a factor.
+
+    Parameters
+    ----------
+    dynamics, diffusion : Tape
+        Over (t, states, ...), shape (n,), and over (t, states), shape (n, m).
+    allowed : collection of int
+        States that are positive.
+
+    Returns
+    -------
+    tuple or None
+        The states that are stated so, and dynamics and diffusion over the same inputs; None without such states.
+    """
+    graph, (n, m) = Graph(dynamics.inputs), diffusion.shape
+    given = [graph.input(slot) for slot in range(len(dynamics.inputs))]
+    rates = dynamics.evaluate(graph.arithmetic(), given)
+    gains = diffusion.evaluate(graph.arithmetic(), given[: n + 1])
+    places = []
+    for i in sorted(allowed):
+        quotients, row = _Quotients(graph, given[i + 1]), gains[i * m : (i + 1) * m]
+        own = [factor for entry in row if (factor := quotients.factor(entry)) is not None]
+        if len(own) < m or all(graph.number(entry) == 0 for entry in row):
+            continue
+        places.append(i)
+        gains[i * m : (i + 1) * m] = own
+        total = graph.const(0.0)
+        for entry in own:
+            total = graph.apply("add", total, graph.apply("sq", entry))
+        rates[i] = graph.apply("sub", quotients.of(rates[i]), graph.apply("mul", graph.const(0.5), total))
+    if not places:
+        return None
+    stated = graph.tape(rates, (n,)), graph.tape(gains, (n, m))
+    return tuple(places), _exponentials(stated[0], places), _exponentials(stated[1], places, n + 1)
+
+
+def _exponentials(tape: Tape, places: Sequence[int], count: int | None = None) -> Tape:
+    """The tape with exp(x_i) for x_i, over the first ``count`` inputs."""
+    graph = Graph(tape.inputs[:count])
+    given = [graph.input(slot) for slot in range(len(graph.inputs))]
+    given += [graph.const(0.0)] * (len(tape.inputs) - len(given))  # the noise knows no signals
+    for i in places:
+        given[i + 1] = graph.apply("exp", given[i + 1])
+    return graph.tape(tape.evaluate(graph.arithmetic(), given), tape.shape)

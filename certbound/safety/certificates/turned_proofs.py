@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from functools import wraps
 
+from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.parts import Writer
-from certbound.safety.engines import Apart, Turned, log10_sum
+from certbound.safety.engines import Apart, Logarithmic, Turned, log10_sum
 
 
 def of_coordinates(write: Writer, *, beside: Writer | None = None, below: bool = False) -> Writer:
@@ -19,6 +20,13 @@ def of_coordinates(write: Writer, *, beside: Writer | None = None, below: bool =
     @wraps(write)
     def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
         found = answer.details
+        if isinstance(found, Logarithmic):
+            if below:
+                return written(problem, found.plain, attempt)
+            if isinstance(found.answer.details, Apart):
+                raise CertificateError("limits that were taken apart in logarithms have no certificate.")
+            proof, log10, assumptions = written(found.problem, found.answer, attempt)
+            return {"engine": "logarithms", "states": list(found.places), "proof": proof}, log10, assumptions
         if not isinstance(found, Turned | Apart):
             return write(problem, answer, attempt)
         if below:

@@ -7,7 +7,7 @@ from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.safety.engines.linear import linear_engine
 from certbound.safety.engines.linear_sketch import linear_chance
-from certbound.safety.engines.oblique_limits import Apart, Turned, in_coordinates
+from certbound.safety.engines.oblique_limits import Apart, Logarithmic, Turned, by_logarithms, in_coordinates
 from certbound.safety.engines.quadratic import quadratic_engine
 from certbound.safety.engines.random_starts import prove_truncated
 from certbound.safety.engines.rooms import joined, log10_sum
@@ -17,6 +17,7 @@ __all__ = [
     "Apart",
     "Barrier",
     "barrier_engine",
+    "by_logarithms",
     "constants_engine",
     "erode",
     "Erosion",
@@ -25,6 +26,7 @@ __all__ = [
     "linear_chance",
     "linear_engine",
     "log10_sum",
+    "Logarithmic",
     "prove_truncated",
     "quadratic_engine",
     "Turned",

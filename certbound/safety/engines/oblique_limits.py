@@ -8,6 +8,10 @@ other coordinates come first: what all have in common wanders, and boxes of it c
 
 States of very different sizes (metres of an atom's motion, and its speed) become multiples of powers of two: norms over
 all states, and grids that rest on them, are wide otherwise.
+
+Where the noise of a state is in proportion to it, and limits keep it positive, logarithms come first: noise is constant
+there, and what falls off as a power of a state does so exponentially. Ito's formula, which they rest on, asks for a
+disturbance that does not see coming noise.
 """
 
 from __future__ import annotations
@@ -29,7 +33,8 @@ from certbound.problem.sets import Faces, HalfSpace
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
 from certbound.safety.engines.rooms import log10_sum
-from certbound.safety.engines.turning import exact_product, scales_of, turned_problem
+from certbound.safety.engines.turning import exact_product, logarithmic, scales_of, turned_problem
+from certbound.watch import OutOfTime, seconds_left, share_of_time
 
 Prove = Callable[[Problem, Request], EngineAnswer]
 Turn = tuple[Array, Array]
@@ -41,6 +46,7 @@ _MOST = 20  # states
 _LONGEST = 4000  # operations of a model that is looked through for sums
 _UNLIKE = 5  # the logarithm to the base 2 of states' ratio from which they are asked in other units, too
 _FAR = 12  # and first
+_HALF = 0.5  # of the time that is left, for logarithms
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -273,3 +279,63 @@ def _words(states: tuple[str, ...], matrix: Array) -> str:
         units = [f"{float(f'{1 / row[k]:.1g}'):g} for {states[k]}" for k, row in enumerate(matrix)]
         return f"that are multiples of about {', '.join(units)}"
     return ", ".join(HalfSpace(row, 0.0).describe(states, "inside").partition(" <= ")[0] for row in rows)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Logarithmic:
+    """What was proved in logarithms of the states ``places``: the answer in these, and the plain one."""
+
+    places: tuple[int, ...]
+    problem: Problem
+    answer: EngineAnswer
+    plain: EngineAnswer
+
+
+def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
+    """The engine, asked in logarithms first where there are states of that kind, and as it is where that is too weak.
+
+    ``again``: that comes only once it is asked thoroughly.
+    """
+
+    def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+        before = asked.before if isinstance(asked.before, Logarithmic) else None
+        other = None
+        if not asked.quick and problem.system.dimension > 1:
+            with contextlib.suppress(InfeasibleError):
+                other = logarithmic(problem)
+        if other is None:
+            return prove(problem, asked)
+        places, turned = other
+        names = ", ".join(f"log {problem.system.states[i]}" for i in places)
+
+        def stated(answer: EngineAnswer, plain: EngineAnswer = _UNASKED) -> EngineAnswer:
+            details = Logarithmic(places=places, problem=turned, answer=answer, plain=plain)
+            return replace(
+                plain, applicable=answer.applicable and answer.certified, log10_delta=answer.log10_delta, margin=None,
+                time=None, constraint=None, method=answer.method, foresight=False, conclusive=plain.conclusive,
+                reason=f"{answer.reason.rstrip('.')}; in the coordinates {names}.", details=details,
+            )  # fmt: skip
+
+        earlier = before and before.answer.details
+        inner = replace(asked, before=earlier, found=lambda answer: asked.found(stated(answer)))
+        found: EngineAnswer | None = None
+        ended, left = True, seconds_left()
+        with share_of_time(_HALF):
+            with contextlib.suppress(InfeasibleError, EnclosureError):
+                found = prove(turned, inner)
+            ended = False
+        if ended and seconds_left() > (1 - _HALF) * left:
+            raise OutOfTime  # another engine has answered meanwhile
+        useful = found is not None and found.applicable and found.certified and found.log10_delta < 0
+        if found is not None and useful:
+            if is_at_most(found.log10_delta, problem.delta):
+                return stated(found)
+            asked.found(stated(found))
+        if found is not None and again and not asked.thorough:
+            return stated(found)
+        plain = prove(problem, replace(asked, before=before.plain.details if before else asked.before))
+        if found is not None and useful and not (plain.applicable and plain.log10_delta <= found.log10_delta):
+            return stated(found, plain)
+        return plain
+
+    return proved

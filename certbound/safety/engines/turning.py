@@ -2,28 +2,35 @@
 
 X solves dX = f dt + g dW and breaks a constraint just where Y = T X solves dY = T f(T^-1 Y) dt + T g(T^-1 Y) dW and
 breaks the same one, stated in y. The start is enclosed by a box, so that upper bounds are kept, and no lower ones.
+
+Or y_i = log x_i for some states that limits keep positive: until one is broken Y_i = log X_i solves the equation that
+Ito's formula gives, and the same paths break x_i <= b and y_i <= log b. Limits are rounded inward, starts outward.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from flint import arb
 
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Tape, compile_numpy, jacobian, turned_tape
+from certbound.problem.model import Tape, compile_numpy, in_logarithms, jacobian, turned_tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Faces, HalfSpace, Inside, Polytope, Region
 from certbound.problem.systems import ContinuousSystem
+from certbound.rigor.balls import lower, precision, upper
 
 _FINEST = 0.25  # of a turn of the dynamics, a first step
 _ORDER = 8
 _SWEEPS = 10
 _MOST_DOUBLINGS = 60
+_LONGEST = 300  # operations, which recursion goes through
 
 
 def scales_of(problem: Problem) -> Array | None:
@@ -32,7 +39,7 @@ def scales_of(problem: Problem) -> Array | None:
     The covariance along the dynamics at the middle of the starts, whose norm is that of balanced states.
     """
     system, n = problem.system, problem.system.dimension
-    if not isinstance(system, ContinuousSystem) or not _is_plain(problem) or not np.isfinite(problem.horizon):
+    if not isinstance(system, ContinuousSystem) or not is_plain(problem) or not np.isfinite(problem.horizon):
         return None
     hull = problem.initial.hull()
     place = [np.float64(value) for value in (0.0, *(hull.lo + hull.hi) / 2)]
@@ -69,7 +76,7 @@ def scales_of(problem: Problem) -> Array | None:
     return np.asarray(np.clip(np.round(np.log2(extent)), -900, 900).astype(int))
 
 
-def _is_plain(problem: Problem) -> bool:
+def is_plain(problem: Problem) -> bool:
     """Whether it has one set of starts, limits and a model that follows the state at once, and nothing else."""
     drawn = problem.ending or problem.initial.random or problem.random
     return not drawn and len(problem.starts) == 1 and problem.hold is None and problem.reach is None
@@ -118,18 +125,13 @@ def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
     system, n = problem.system, problem.system.dimension
     if not np.array_equal(exact_product(matrix, inverse), np.eye(n)):
         raise InfeasibleError("the matrices of other coordinates must be inverse to each other.")
-    if not isinstance(system, ContinuousSystem) or not _is_plain(problem):
+    if not isinstance(system, ContinuousSystem) or not is_plain(problem):
         raise InfeasibleError("other coordinates serve plain problems in continuous time.")
     moved = {j for j in range(n) if np.any(inverse[j] != np.eye(n)[j])}
     if problem.domain is not None and any(np.isfinite([problem.domain.low[j], problem.domain.high[j]]).any()
                                           for j in moved):  # fmt: skip
         raise InfeasibleError("the domain bounds a state that other coordinates replace.")
-    law = isinstance(problem.plan, Tape)
-    signals: dict[str, Any] = {}
-    if system.inputs is not None and not law:
-        signals |= {"inputs": system.inputs, "input_names": system.input_names}
-    if system.disturbance is not None:
-        signals |= {"disturbance": system.disturbance, "disturbance_names": system.disturbance_names}
+    law, signals = isinstance(problem.plan, Tape), _signals(problem)
     turned = ContinuousSystem(
         turned_tape(problem.closed_loop, inverse, matrix)[0], states=system.states,
         diffusion=_diffusion(system.diffusion, matrix, inverse), **signals,
@@ -140,6 +142,16 @@ def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
         return problem.replace(system=turned, initial=start, safe=safe, plan=plan, cost=None, units=None)
     except ValueError as error:
         raise InfeasibleError(f"a box around the starts in other coordinates is too large: {error}") from error
+
+
+def _signals(problem: Problem) -> dict[str, Any]:
+    """The inputs that no law replaces, and the disturbances."""
+    system, found = problem.system, dict[str, Any]()
+    if system.inputs is not None and not isinstance(problem.plan, Tape):
+        found |= {"inputs": system.inputs, "input_names": system.input_names}
+    if system.disturbance is not None:
+        found |= {"disturbance": system.disturbance, "disturbance_names": system.disturbance_names}
+    return found
 
 
 def _diffusion(diffusion: Array | Tape, matrix: Array, inverse: Array) -> Array | Tape:
@@ -179,3 +191,120 @@ def _constraint(constraint: Inside, inverse: Array, moved: set[int]) -> Inside:
     rows, bounds = exact_product(region.lifted(region.form.normals, n), inverse), region.form.bounds
     turned = HalfSpace(rows[0], bounds[0]) if region.kind == "halfspace" else Polytope(rows, bounds)
     return type(constraint)(turned, during=constraint.during, label=constraint.label)
+
+
+def logarithmic(problem: Problem) -> tuple[tuple[int, ...], Problem] | None:
+    """The states that are stated by their logarithms, and the problem stated so; None where there are none.
+
+    Proves: P(failing) is at most the largest probability of failing in the problem that is returned.
+
+    Raises
+    ------
+    InfeasibleError
+        If the problem cannot be stated so: a start has no room once it is rounded, say.
+
+    Examples
+    --------
+    >>> import certbound as cb
+    >>> system = cb.ContinuousSystem(lambda x: 0.1 * x, states=["price"], diffusion=lambda x: [[0.2 * x[0]]])
+    >>> problem = cb.Problem(system, initial=[1.0], safe=[cb.Inside(cb.Box([0.5], [2.0]))], horizon=1.0)
+    >>> places, stated = logarithmic(problem)
+    >>> places, stated.system.diffusion.tolist(), round(float(stated.safe[0].region.high[0]), 3)
+    ((0,), [[0.2]], 0.693)
+    """
+    system, n = problem.system, problem.system.dimension
+    if not isinstance(system, ContinuousSystem) or not isinstance(system.diffusion, Tape) or not is_plain(problem):
+        return None
+    if problem.domain is not None or not np.isfinite(problem.horizon):
+        return None
+    if max(len(system.diffusion.nodes), len(problem.closed_loop.nodes)) > _LONGEST:
+        return None
+    positive, barred = _limited(problem)
+    found = in_logarithms(problem.closed_loop, system.diffusion, positive - barred)
+    if found is None:
+        return None
+    places, dynamics, diffusion = found
+    law = isinstance(problem.plan, Tape)
+    names, signals = tuple(f"log_{x}" if i in places else x for i, x in enumerate(system.states)), _signals(problem)
+    given: Array | Tape = diffusion
+    constants = [diffusion.nodes[output] for output in diffusion.outputs]
+    if all(node.op == "const" for node in constants):
+        given = np.array([node.value for node in constants]).reshape(diffusion.shape)
+    elif all(node.op != "input" for node in diffusion.nodes):
+        raise InfeasibleError("the noise is constant in logarithms, which is not stated so.")
+    try:
+        turned = ContinuousSystem(
+            replace(dynamics, inputs=("t", *names, *dynamics.inputs[n + 1 :])), states=names,
+            diffusion=replace(given, inputs=("t", *names)) if isinstance(given, Tape) else given, **signals,
+        )  # fmt: skip
+        return places, problem.replace(
+            system=turned, initial=_start_by(problem, places), safe=[_image(one, places, n) for one in problem.safe],
+            plan=None if law else problem.plan, cost=None, units=None,
+        )  # fmt: skip
+    except ValueError as error:
+        raise InfeasibleError(f"the problem is not stated in logarithms: {error}") from error
+
+
+def _limited(problem: Problem) -> tuple[set[int], set[int]]:
+    """States that a limit for all time keeps positive, and states that some limit asks for in another way."""
+    n = problem.system.dimension
+    positive, barred = set[int](), set[int]()
+    for constraint in problem.safe:
+        region: Region = constraint.region
+        flat = isinstance(region.form, Faces) and region.kind in ("box", "halfspace", "polytope")
+        if not flat or region.moving or np.any(region.center_at()):
+            barred |= set(region.places(n))
+            continue
+        assert isinstance(region.form, Faces)
+        for row, bound in zip(region.lifted(region.form.normals, n), region.form.bounds):
+            own = np.flatnonzero(row).tolist()
+            if len(own) > 1:
+                barred |= set(own)
+            elif row[own[0]] < 0 and bound < 0 and not constraint.outside and constraint.during is None:
+                positive.add(own[0])
+            elif bound * row[own[0]] <= 0:
+                barred.add(own[0])
+    return positive, barred
+
+
+def _log(value: arb, *, up: bool) -> float:
+    with precision():
+        return upper(value.log()) if up else lower(value.log())
+
+
+def _start_by(problem: Problem, places: tuple[int, ...]) -> Box:
+    """A box around the starts, rounded outward."""
+    hull = problem.initial.hull()
+    low, high = hull.lo.copy(), hull.hi.copy()
+    for i in places:
+        if not low[i] > 0:
+            raise InfeasibleError("a start is not positive.")
+        low[i], high[i] = _log(arb(low[i]), up=False), _log(arb(high[i]), up=True)
+    return Box(low, high)
+
+
+def _image(constraint: Inside, places: tuple[int, ...], n: int) -> Inside:
+    region: Region = constraint.region
+    if not set(places) & set(region.places(n)):
+        return constraint
+    assert isinstance(region.form, Faces)
+    rows, bounds = region.lifted(region.form.normals, n).copy(), region.form.bounds.copy()
+    for number, row in enumerate(rows):
+        i = int(np.flatnonzero(row)[0])
+        if i in places:
+            with precision():
+                end = arb(float(bounds[number])) / arb(float(row[i]))
+            positive = bool(row[i] > 0)
+            side = _log(end, up=constraint.outside == positive)
+            rows[number], bounds[number] = 0.0, side if positive else -side
+            rows[number, i] = 1.0 if positive else -1.0
+    if region.kind == "box":
+        low, high = np.full(n, -math.inf), np.full(n, math.inf)
+        for row, bound in zip(rows, bounds):
+            i = int(np.flatnonzero(row)[0])
+            low[i], high[i] = (low[i], bound) if row[i] > 0 else (-bound, high[i])
+        kept = list(region.places(n))
+        stated: Any = Box(low[kept], high[kept], coordinates=region.coordinates)
+    else:
+        stated = HalfSpace(rows[0], bounds[0]) if region.kind == "halfspace" else Polytope(rows, bounds)
+    return type(constraint)(stated, during=constraint.during, label=constraint.label)

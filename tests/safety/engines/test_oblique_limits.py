@@ -15,7 +15,8 @@ from certbound.arrays import Array
 from certbound.checker import check_data, parse
 from certbound.checker.reading import Record
 from certbound.checker.report import Budget
-from certbound.checker.statement import read_model, turned_model
+from certbound.checker.statement import read_model
+from certbound.checker.statement.turned import turned_model
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, turned_tape
 from certbound.safety.answers import EngineAnswer, Request, exact
