@@ -130,10 +130,13 @@ def names(name: str, value: Sequence[str], reserved: Iterable[str] = ()) -> tupl
     return result
 
 
+_OTHER_NAMES = {"normal": "gaussian", "double_exponential": "laplace", "empirical": "histogram"}
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """``; did you mean 'x'?`` with the nearest known word, or the list of known words."""
     known = sorted(known)
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    close = [_OTHER_NAMES[word]] if _OTHER_NAMES.get(word) in known else difflib.get_close_matches(word, known, 1, 0.6)
     return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(dict.fromkeys(known)) or 'none'}."
 
 

@@ -158,6 +158,7 @@ def test_faults_are_named(old, new, message):
         ("std = 0.1", "halfwidth = 0.1", r"needs exactly one of std, variance, covariance; got \['halfwidth'\]"),
         ("std = 0.1", "std = 0.1\nindependent = true", "`noise.independent` must be omitted for law 'gaussian'"),
         ('law = "gaussian"', 'law = "cauchy"', r"`noise.law` must be one of gaussian, .*, got 'cauchy'"),
+        ('law = "gaussian"', 'law = "normal"', "got 'normal'; did you mean 'gaussian'"),
         ('law = "gaussian"\nstd = 0.1\nmatrix', "diffusion", "`diffusion` is for continuous time"),
         ("matrix = [[1], [0.5]]", "matrix = 0.1", "`noise_matrix` must be a matrix with 2 rows"),
         ("matrix = [[1], [0.5]]", "matrix = [[1], [0.5, 2]]", r"`noise\.matrix` must have rows of equal length"),
