@@ -2,10 +2,11 @@
 
 From the bottom: ``boundaries`` (what is safe, in outward-rounded arithmetic), ``region`` (a box around it), ``cuts``
 (the cells and parts of cells that it meets), ``proof``, ``continuation`` (proposals of log U), ``walled_ramps`` and
-``near_walls`` (of U), ``bounding``.
+``near_walls`` (of U), ``bounding``; ``target_ramps`` proposes for targets.
 """
 
 from certbound.values.continuous.curved.bounding import bound_region
 from certbound.values.continuous.curved.region import boxed, walled
+from certbound.values.continuous.curved.target_ramps import target_ramps
 
-__all__ = ["bound_region", "boxed", "walled"]
+__all__ = ["bound_region", "boxed", "target_ramps", "walled"]
