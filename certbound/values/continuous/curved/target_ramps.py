@@ -108,7 +108,7 @@ class _Rounded:
         return np.asarray(-deep * self.unit.min())
 
 
-def target_ramps(plane: Plane, target: Region, cells: int, upper: bool) -> TargetRamps:
+def ramps_to(plane: Plane, target: Region, cells: int, upper: bool) -> TargetRamps:
     """The solver for a target that is a polytope with faces along the states; lines of the grid go by its faces.
 
     They lie a hair inside for upper bounds of failing and outside for lower ones, so that rounding decides nothing.
