@@ -215,8 +215,11 @@ class Surface:
 
     def face_ranges(self, axis: int, side: int) -> tuple[Array, Array]:
         """Bounds of V on the cells of one face of the grid, shape (K, *cells along the other states)."""
-        edge = 0 if side == 0 else -1
-        index: tuple[Any, ...] = (slice(None), *((slice(None),) * (2 * axis)), edge, 0)
+        return self.across(axis, -side)
+
+    def across(self, axis: int, node: int) -> tuple[Array, Array]:
+        """The same where a state is at one of its nodes."""
+        index: tuple[Any, ...] = (slice(None), *((slice(None),) * (2 * axis)), node, 0)
         parts = [self.values[:-1], self.start_rates, self.values[1:], self.end_rates]
         data = np.stack([part[index] for part in parts], axis=1)
         rest = tuple(nodes for k, nodes in enumerate(self.axes) if k != axis)

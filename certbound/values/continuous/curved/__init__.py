@@ -2,10 +2,10 @@
 
 From the bottom: ``boundaries`` (what is safe, in outward-rounded arithmetic), ``region`` (a box around it), ``cuts``
 (the cells and parts of cells that it meets), ``proof``, ``continuation`` (proposals of log U), ``walled_ramps`` and
-``near_walls`` (of U), ``bounding``.
+``near_walls`` (of U), ``bounding``; ``target_ramps`` proposes for targets.
 """
 
-from certbound.values.continuous.curved.bounding import bound_region
+from certbound.values.continuous.curved.bounding import bound_region, target_ramps
 from certbound.values.continuous.curved.region import boxed, walled
 
-__all__ = ["bound_region", "boxed", "walled"]
+__all__ = ["bound_region", "boxed", "target_ramps", "walled"]

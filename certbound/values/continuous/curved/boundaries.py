@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -131,6 +132,12 @@ class Walls:
             gaps = [wall.distance(x, y) for wall in walls]
             best = np.minimum(best, np.max(gaps, axis=0) if outside else -np.max(gaps, axis=0))
         return np.asarray(best)
+
+
+class Deep(Protocol):
+    """What says how far points are from walls, positive on the safe side."""
+
+    def depth(self, x: Array, y: Array) -> Array: ...
 
 
 def walls_of(region: Region) -> tuple[Wall, ...]:

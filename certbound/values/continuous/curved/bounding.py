@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,6 +41,9 @@ from certbound.values.continuous.residual import sample_in_plane, value_range
 from certbound.values.continuous.room import limits_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
+
+if TYPE_CHECKING:
+    from certbound.values.continuous.curved.target_ramps import TargetRamps
 
 _FACTOR = 1.12
 _TOP = -0.1  # where V is above, the proof may lift it over 0 instead
@@ -93,6 +97,13 @@ def bound_region(problem: Problem, model: Model, deadline: float, wanted: float,
         done.append(f"{plan.cells}^2")
     words = f"value function in two states within curved limits, cells: {', '.join(done)}"
     return upper, None, words, ([], [])
+
+
+def target_ramps(plane: Plane, target: Set, cells: int, upper: bool) -> TargetRamps:
+    """What proposes the probability of arriving in a target of axial faces."""
+    from certbound.values.continuous.curved.target_ramps import ramps_to
+
+    return ramps_to(plane, target, cells, upper)
 
 
 def _in_box(

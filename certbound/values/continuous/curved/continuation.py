@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.values.continuous.curved.boundaries import Walls
+from certbound.values.continuous.curved.boundaries import Deep, Walls
 from certbound.values.continuous.plane import Plan, Plane, Solver, Source, integrated, spread_nodes
 from certbound.values.continuous.surface import Surface
 
@@ -112,7 +112,7 @@ def crowded_nodes(plane: Plane, plan: Plan, axis: int, curve: Array, crowd: floa
     return spread_nodes(plane, plan, axis, more)
 
 
-def wall_points(walls: Walls, plane: Plane, count: int) -> Array:
+def wall_points(walls: Deep, plane: Plane, count: int) -> Array:
     """Points of the walls within the box, shape (M, 2), where the lines of an even grid cross them."""
     axes = [np.linspace(low, high, count + 1) for low, high in zip(plane.low, plane.high)]
     found = []

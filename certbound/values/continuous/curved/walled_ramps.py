@@ -13,7 +13,7 @@ from scipy.sparse import csc_matrix, csr_matrix, diags, kron, vstack
 from scipy.sparse.linalg import splu
 
 from certbound.arrays import Array, Mask
-from certbound.values.continuous.curved.boundaries import Walls
+from certbound.values.continuous.curved.boundaries import Deep, Walls
 from certbound.values.continuous.curved.continuation import crowded_nodes, wall_points
 from certbound.values.continuous.curved.cuts import Cuts
 from certbound.values.continuous.curved.proof import least_on_walls
@@ -33,7 +33,7 @@ _SYMMETRIC = {"SymmetricMode": True}  # normal equations need no pivots, so that
 class WalledRamps(Ramps):
     """U = 1 on the walls, but for the ramp at T."""
 
-    def __init__(self, plane: Plane, walls: Walls, cells: int) -> None:
+    def __init__(self, plane: Plane, walls: Deep, cells: int) -> None:
         self.walls, self.curve = walls, wall_points(walls, plane, 4 * cells)
         super().__init__(plane, cells, _lead(plane, cells))
         self.points = [(nodes[:-1, None] + np.diff(nodes)[:, None] * _PLACES).ravel() for nodes in self.nodes]
@@ -60,6 +60,7 @@ class WalledRamps(Ramps):
         return crowded_nodes(self.plane, plan, axis, self.curve, _CROWD)
 
     def least(self, whole: Surface) -> float:
+        assert isinstance(self.walls, Walls)
         return min(super().least(whole), least_on_walls(whole, Cuts.of(whole.axes, self.walls)))
 
     def _weakened(self, force: Array, a: Array, places: Sequence[Array]) -> Array:

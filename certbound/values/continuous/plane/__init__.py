@@ -12,6 +12,7 @@ from certbound.values.continuous.plane.plane_targets import bound_failing
 from certbound.values.continuous.plane.plane_windows import bound_windows
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
 from certbound.values.continuous.plane.stages import windowed
+from certbound.values.continuous.plane.target_proposal import bent, sides_of
 from certbound.values.continuous.plane.two_sides import (
     Found,
     bound_box,
@@ -26,8 +27,8 @@ from certbound.values.continuous.plane.two_sides import (
 )
 
 __all__ = [
-    "Floats", "Found", "Pair", "Plan", "Plane", "Solver", "Source", "bound_box", "bound_failing", "bound_moving",
-    "bound_plane_above", "bound_windows", "chart_plane", "confined", "floats_of", "held_plane", "integrated", "led",
-    "moving", "plane_of", "reach_of", "released", "rough_level", "slab_times", "solve_lines", "spread_nodes",
-    "two_states", "windowed",
+    "Floats", "Found", "Pair", "Plan", "Plane", "Solver", "Source", "bent", "bound_box", "bound_failing",
+    "bound_moving", "bound_plane_above", "bound_windows", "chart_plane", "confined", "floats_of", "held_plane",
+    "integrated", "led", "moving", "plane_of", "reach_of", "released", "rough_level", "sides_of", "slab_times",
+    "solve_lines", "spread_nodes", "two_states", "windowed",
 ]

@@ -11,8 +11,9 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -20,13 +21,13 @@ from certbound.arrays import Array, Mask
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Faces, Region
-from certbound.rigor.intervals import Interval
 from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import (
     LIFTS,
     NEGLIGIBLE,
     Model,
     Need,
+    Proof,
     cheapest,
     covers,
     examine,
@@ -38,12 +39,11 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.payment import Payment, pay_lower
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_reach import reach_of
-from certbound.values.continuous.plane.target_proposal import propose_to_target
+from certbound.values.continuous.plane.target_proposal import Fate, propose_to_target, sides_of
 from certbound.values.continuous.plane.two_sides import RATE, plane_of
 from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.room import limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface
-from certbound.values.sets import contains
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]
@@ -63,52 +63,16 @@ _ROUNDS = 4  # of coarse proposals that find out about it
 _COARSE = 24
 _SHARES = (0.12, 0.5)  # of the patches, for one grid after the other
 _BEYOND = 0.6  # of the paths' extent, where nothing bounds a state
+INVERSE = 2.0**8  # 1 / e of V = -e Q
+_FACTORS = (0.6, 0.9, 1.12, 1.12, 1.5, 3.0)  # of the residual, for one source after the other
+_SAMPLED = 3  # of which samples tell
+_WORSE = 3.0  # times the least residual of those before: sources do not help any more
+_COST, _MOST = 0.009, 56  # seconds of both sides, over cells^2, and most cells
 _DEEP = 0.25  # of the box's width: how deep the box reaches into a target that takes up one of its sides
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Fate:
-    """What becomes of the paths in the cells of a grid, shape ``cells``.
-
-    ``alive``: not all of the cell lies in the target; ``beside``: these of them that touch it; ``met``: cells that
-    hold all points of the target.
-    """
-
-    alive: Mask
-    beside: Mask
-    met: Mask
-
-    @classmethod
-    def of(cls, axes: tuple[Array, ...], target: Region) -> Fate:
-        low = np.meshgrid(*(axis[:-1] for axis in axes), indexing="ij")
-        high = np.meshgrid(*(axis[1:] for axis in axes), indexing="ij")
-        cells = Interval(*(np.stack([side.ravel() for side in ends], axis=1) for ends in (low, high)))
-        inside, outside = (mask.reshape(low[0].shape) for mask in contains(target, cells, 0))
-        met = ~outside
-        if target.form.axial:
-            met &= np.logical_and.outer(*(_holding(axis, *ends) for axis, ends in zip(axes, sides_of(target))))
-        return cls(alive=~inside, beside=~inside & ~outside, met=met)
-
-
-def sides_of(target: Region) -> list[Pair]:
-    """The ends of a region along both states; infinite where there is none."""
-    around, places = target.hull(), target.places(2)
-    sides = {place: (float(low), float(high)) for place, low, high in zip(places, around.lo, around.hi)}
-    return [sides.get(axis, (-math.inf, math.inf)) for axis in (0, 1)]
-
-
-def _holding(axis: Array, low: float, high: float) -> Mask:
-    """Cells of an axis that hold an interval's points, without those that a neighbour makes unnecessary."""
-    holding = (axis[:-1] <= high) & (axis[1:] >= low)
-    spare = axis[1:] == low
-    spare[-1] = False
-    other = axis[:-1] == high if low < high else np.zeros(len(axis) - 1, dtype=bool)
-    other[0] = False
-    return np.asarray(holding & ~spare & ~other)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Aim:
+class Aim:
     """A problem with a target, as proofs of one side see it; at ``open`` faces (state, side) the box is only cut."""
 
     plane: Plane
@@ -119,39 +83,70 @@ class _Aim:
     points: Array | None
 
 
-def prove_failing_above(surface: Surface, aim: _Aim) -> Proposed:
+def prove_failing_above(surface: Surface, aim: Aim) -> Proposed:
     """The surface, raised by what it misses, and an upper bound of log P(failing), whatever it is."""
+    return proved_above(surface, aim)[:2]
+
+
+def proved_above(surface: Surface, aim: Aim, negligible: float = NEGLIGIBLE) -> tuple[Surface, Payment, Proof | None]:
+    """The same with what was seen; ``negligible`` stands for `NEGLIGIBLE`."""
     fate = Fate.of(surface.axes, aim.target)
-    if not fate.beside.any():
-        return surface, Payment(log=0.0)
     for _ in range(3):
         late = float(surface.range_at(-1)[0][fate.alive].min(initial=0.0))
         missing = -min(0.0, late, *_on_faces(surface, fate, _FACES)[0])
         surface = surface.raised(up(missing)) if missing > 0 else surface
-    if missing > 0:
-        return surface, Payment(log=0.0)
+    if missing > 0 or fate.alive.all():
+        return surface, Payment(log=0.0), None
     start = up(extreme_over(surface, aim.plane.starts, upper=True))
-    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=0.0)
+    need = Need(spare=negligible / float(surface.times[-1]), start=start, top=0.0)
     proof = examine(surface, aim.model, need, upper=True, alive=fate.alive)
-    payment, lift = cheapest(proof, need, surface, start, _over(surface, fate.beside)[0])
-    return surface, replace(payment, lift=lift)
+    payment, lift = cheapest(proof, need, surface, start, _around(surface, ~fate.alive)[0])
+    return surface, replace(payment, lift=lift), proof
 
 
-def prove_failing_below(surface: Surface, aim: _Aim) -> Payment | None:
+def prove_failing_below(surface: Surface, aim: Aim) -> Payment | None:
     """A lower bound of log P(failing) from the best start, whatever the surface is; None where none is positive."""
+    found = proved_below(surface, aim)
+    return None if found is None else found[0]
+
+
+def proved_below(surface: Surface, aim: Aim, negligible: float = NEGLIGIBLE) -> tuple[Payment | None, Proof] | None:
+    """The same with what was seen, where some start may count."""
     fate = Fate.of(surface.axes, aim.target)
-    highest = _over(surface, fate.alive)[1]
+    highest = _over(surface, ~fate.met)[1]
     surface = surface.raised(-highest - 1e-12 * (1 + highest)) if highest > 0 else surface
+    if _may_lie_in(surface.axes, aim.plane.starts, fate.met):  # V says nothing of a path that is there already
+        return None
     start = extreme_over(surface, aim.plane.starts, upper=False, points=aim.points)
-    ceiling = max(_over(surface, fate.met)[1], *_on_faces(surface, fate, aim.open)[1], -700.0)
+    ceiling = max(_around(surface, fate.met)[1], *_on_faces(surface, fate, aim.open)[1], -700.0)
     if not start > ceiling:
         return None
     start = -up(-start)
-    need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=start, top=np.inf)
-    proof = examine(surface, aim.model, need, upper=False, alive=fate.alive)
+    need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf, bottom=ceiling)
+    proof = examine(surface, aim.model, need, upper=False, alive=~fate.met)
     if np.any(proof.ranges.high > 0):
         return None
-    return pay_lower(patched_of(proof, -proof.ranges.residual_low, need, surface.steps), start, ceiling)
+    payment = pay_lower(patched_of(proof, -proof.ranges.residual_low, need, surface.steps), start, ceiling)
+    return payment, proof
+
+
+def _may_lie_in(axes: tuple[Array, ...], starts: Sequence[Pair], cells: Mask) -> bool:
+    """Whether the box of the starts meets some of the closed cells."""
+    near = [(axis[:-1] <= high) & (axis[1:] >= low) for axis, (low, high) in zip(axes, starts)]
+    return bool(cells[np.ix_(*near)].any())
+
+
+def _around(surface: Surface, over: Mask) -> tuple[float, float]:
+    """Ends of V at all times where a path may enter the cells that are over."""
+    low, high = math.inf, -math.inf
+    for axis in (0, 1):
+        rows = np.moveaxis(over, axis, 0)
+        for node in range(1, len(rows)):
+            entered = rows[node - 1] != rows[node]
+            if entered.any():
+                least, most = (part[:, entered] for part in surface.across(axis, node))
+                low, high = min(low, float(least.min())), max(high, float(most.max()))
+    return low, high
 
 
 _FACES = tuple(itertools.product((0, 1), (0, 1)))
@@ -190,10 +185,10 @@ class _Sketch:
     sign: float
 
     @classmethod
-    def of(cls, surface: Surface, aim: _Aim) -> _Sketch:
+    def of(cls, surface: Surface, aim: Aim, granted: float = _GRANTED) -> _Sketch:
         start = extreme_over(surface, aim.plane.starts, upper=aim.upper, points=aim.points)
         worst, level = sampled_residual(surface, aim.model, upper=aim.upper)
-        paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - level - _VARIED, 50.0))
+        paid = granted / float(surface.times[-1]) * np.exp(np.minimum(start - level - _VARIED, 50.0))
         excess = np.maximum(worst - paid, 0.0) * Fate.of(surface.axes, aim.target).alive
         return cls(surface=surface, start=start, excess=excess, level=level, sign=1.0 if aim.upper else -1.0)
 
@@ -210,7 +205,7 @@ class _Sketch:
         return np.where(self.level < _TOP, due, 0.0) if self.sign > 0 else due
 
 
-def _promising(aim: _Aim, plan: Plan) -> Surface | None:
+def _promising(aim: Aim, plan: Plan) -> Surface | None:
     """The proposal whose bound will be the best of a few, each with a source made of what the last one would pay."""
     source: Source | None = None
     best: _Sketch | None = None
@@ -226,12 +221,62 @@ def _promising(aim: _Aim, plan: Plan) -> Surface | None:
     return None if best is None else best.surface
 
 
+class Solves(Protocol):
+    """What proposes V = -e Q, Q being about the probability of arriving."""
+
+    def failing(self, source: Source | None) -> Surface: ...
+
+
+Likely = Callable[[Plane, Region, int, bool], Solves]
+
+
+def _corrected(aim: Aim, solver: Solves) -> Proposed | None:
+    """The best bound of proposals whose residual, as samples and then as bounds tell it, feeds the next one."""
+    source: Source | None = None
+    best: Proposed | None = None
+    sign, least = (1.0, math.inf) if aim.upper else (-1.0, math.inf)
+    for number, factor in enumerate(_FACTORS):
+        surface = solver.failing(source)
+        if not covers(surface, aim.plane.horizon, aim.plane.low, aim.plane.high, within=aim.upper):
+            break
+        sketch, fate = _Sketch.of(surface, aim, granted=0.0), Fate.of(surface.axes, aim.target)
+        over = ~fate.alive if aim.upper else fate.met
+        due = (sketch.level < 0 if aim.upper else sketch.level > _around(surface, over)[1]) & ~over
+        needed = np.where(due, sketch.excess, 0.0)
+        paid = float(needed.max(axis=(1, 2)) @ surface.steps)
+        if not math.isfinite(paid) or paid > _WORSE * least:
+            break
+        least = min(least, paid)
+        if number >= _SAMPLED and paid < -surface.values[0].min(initial=0.0):
+            made, payment, proof = _proved(surface, aim)
+            if payment is not None and (best is None or sign * payment.log < sign * best[1].log):
+                best = made, payment
+            if proof is not None:
+                excess = proof.ranges.residual_high if aim.upper else -proof.ranges.residual_low
+                table = np.zeros((surface.slabs, over.size))
+                table[proof.slab, proof.cell] = np.where(proof.ranges.low < 0, np.maximum(excess, 0.0), 0.0)
+                needed = table.reshape(needed.shape)
+            if not np.isfinite(needed).all():
+                break
+        more = Source.above(surface, factor * needed * INVERSE)
+        source = more if source is None else source.plus(more)
+    return best
+
+
+def _proved(surface: Surface, aim: Aim) -> tuple[Surface, Payment | None, Proof | None]:
+    spare = NEGLIGIBLE / INVERSE
+    if aim.upper:
+        return proved_above(surface, aim, spare)
+    return surface, *(proved_below(surface, aim, spare) or (None, None))
+
+
 def bound_failing(
-    problem: Problem, model: Model, target: Region, deadline: float
+    problem: Problem, model: Model, target: Region, deadline: float, likely: Likely
 ) -> tuple[float, float | None, str, tuple[list[Proposed], list[Proposed]]]:
     """Natural logarithms of an upper and a lower bound of P(failing) (None: there is none), and words.
 
     ``problem`` has no target; the arrival has to be within its horizon. What certificates state of both comes last.
+    ``likely`` proposes the probability of arriving itself, which is tried first.
 
     Raises
     ------
@@ -245,18 +290,30 @@ def bound_failing(
     for aim in aims:
         check_noise(model, (0.0, aim.plane.horizon), list(zip(aim.plane.low, aim.plane.high)))
     patches = RATE * max(1.0, round(deadline - time.perf_counter(), 1))
-    floor = _floor(aims[0])
     upper, lower, done = 0.0, -math.inf, list[str]()
     above, below = list[Proposed](), list[Proposed]()
+    if target.form.axial and aims[0].plane.autonomous and len(model.branches) == 1:
+        cells = min(max(round(math.sqrt(patches / RATE / _COST)), _FEWEST), _MOST)
+        for aim, kept in zip(aims, (above, below)):
+            with contextlib.suppress(OutOfTime, RuntimeError, ValueError):  # a singular system, numbers that overflow
+                found = _corrected(aim, likely(aim.plane, target, cells, aim.upper))
+                kept += [] if found is None else [found]
+        upper = min((one[1].log for one in above), default=0.0)
+        lower = max((one[1].log for one in below), default=-math.inf)
+        if upper < 0 and lower > -math.inf:
+            return upper, lower, f"value function with a target in two states, cells: {cells}^2", (above, below)
+        patches /= 2
+        done.append(f"{cells}^2")
+    floor, likelier = _floor(aims[0]), (bool(above), bool(below))
     for cells in sorted({_cells(aims[0].plane.horizon, share * patches) for share in _SHARES}):
         plan = _plan(aims[0].plane.horizon, floor, cells)
         with contextlib.suppress(OutOfTime):
-            surface = _promising(aims[0], plan)
+            surface = _promising(aims[0], plan) if not likelier[0] else None
             if surface is not None:
                 found = prove_failing_above(surface, aims[0])
                 above += [found] if found[1].log < upper else []
                 upper = min(upper, found[1].log)
-            surface = _promising(aims[1], plan)
+            surface = _promising(aims[1], plan) if not likelier[1] else None
             payment = None if surface is None else prove_failing_below(surface, aims[1])
             if surface is not None and payment is not None and payment.log > lower:
                 lower = payment.log
@@ -289,7 +346,7 @@ def _simplified(target: Region) -> Region:
     return target
 
 
-def _aim(problem: Problem, model: Model, target: Region, *, upper: bool) -> _Aim:
+def _aim(problem: Problem, model: Model, target: Region, *, upper: bool) -> Aim:
     room = limits_of(problem)
     ends = [[*room.inner_low], [*room.inner_high]] if upper else [[*room.outer_low], [*room.outer_high]]
     starts, open_faces = starts_of(problem), list[tuple[int, int]]()
@@ -310,10 +367,10 @@ def _aim(problem: Problem, model: Model, target: Region, *, upper: bool) -> _Aim
     if not all(low < high for low, high in zip(*ends)):
         raise InfeasibleError("the safe set has no interior.")
     plane = replace(floats, low=(ends[0][0], ends[0][1]), high=(ends[1][0], ends[1][1]))
-    return _Aim(plane=plane, model=model, target=target, open=tuple(open_faces), upper=upper, points=points_of(problem))
+    return Aim(plane=plane, model=model, target=target, open=tuple(open_faces), upper=upper, points=points_of(problem))
 
 
-def _floor(aim: _Aim) -> float:
+def _floor(aim: Aim) -> float:
     """log w, w a share of the probability of failing that coarse proposals find."""
     floor = math.log(_SHARE)
     for _ in range(_ROUNDS):
@@ -322,7 +379,8 @@ def _floor(aim: _Aim) -> float:
         if surface is None:
             break
         fate = Fate.of(surface.axes, aim.target)
-        level, least = extreme_over(surface, aim.plane.starts, upper=True), _over(surface, fate.beside)[0]
+        level = extreme_over(surface, aim.plane.starts, upper=True)
+        least = min(_around(surface, ~fate.alive)[0], 0.0)
         share = max(-math.expm1(min(least - level, 0.0)), 1e-3)  # of e^V that is not w
         found = min(max(level + math.log(share * _SHARE), -40.0), _HIGHEST)
         if abs(found - floor) < 0.3:

@@ -7,14 +7,17 @@ from a little outside for lower ones. Depths are measured in cells.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Mask
 from certbound.problem.sets import Faces, Region
-from certbound.values.continuous.plane.plane_grids import Plan, Plane, Source, layer_rate, mean_deviation
+from certbound.rigor.intervals import Interval
+from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, layer_rate, mean_deviation
 from certbound.values.continuous.plane.solver import Solver, integrated
 from certbound.values.continuous.surface import Surface
+from certbound.values.sets import contains
 
 _RAMP = 3.0  # cells over which V falls into the target at the horizon
 _DRAWN = 2.0  # how fast V is drawn in the target, in units of the noise over a cell
@@ -30,6 +33,45 @@ _WIDER = 3.0  # how much more slowly V rises beside the target there, for lower 
 _CORNER = 3.0  # cells from a corner of the box within which there is no source
 _STIFF = 20.0  # by how much what V is drawn by may exceed one over a step
 _BENT = 0.05  # what a cell may lose of its width where nodes are moved to places
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Fate:
+    """What becomes of the paths in the cells of a grid, shape ``cells``.
+
+    ``alive``: not all of the cell lies in the target; ``met``: cells that hold all points of the target.
+    """
+
+    alive: Mask
+    met: Mask
+
+    @classmethod
+    def of(cls, axes: tuple[Array, ...], target: Region) -> Fate:
+        low = np.meshgrid(*(axis[:-1] for axis in axes), indexing="ij")
+        high = np.meshgrid(*(axis[1:] for axis in axes), indexing="ij")
+        cells = Interval(*(np.stack([side.ravel() for side in ends], axis=1) for ends in (low, high)))
+        inside, outside = (mask.reshape(low[0].shape) for mask in contains(target, cells, 0))
+        met = ~outside
+        if target.form.axial:
+            met &= np.logical_and.outer(*(_holding(axis, *ends) for axis, ends in zip(axes, sides_of(target))))
+        return cls(alive=~inside, met=met)
+
+
+def sides_of(target: Region) -> list[Pair]:
+    """The ends of a region along both states; infinite where there is none."""
+    around, places = target.hull(), target.places(2)
+    sides = {place: (float(low), float(high)) for place, low, high in zip(places, around.lo, around.hi)}
+    return [sides.get(axis, (-math.inf, math.inf)) for axis in (0, 1)]
+
+
+def _holding(axis: Array, low: float, high: float) -> Mask:
+    """Cells of an axis that hold an interval's points, without those that a neighbour makes unnecessary."""
+    holding = (axis[:-1] <= high) & (axis[1:] >= low)
+    spare = axis[1:] == low
+    spare[-1] = False
+    other = axis[:-1] == high if low < high else np.zeros(len(axis) - 1, dtype=bool)
+    other[0] = False
+    return np.asarray(holding & ~spare & ~other)
 
 
 def propose_to_target(

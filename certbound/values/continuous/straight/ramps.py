@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix, diags, eye, kron, vstack
@@ -223,17 +224,19 @@ class Ramps:
         forward = self.plane.horizon - times[::-1]
         forward[0], forward[-1] = 0.0, self.plane.horizon
 
-        def made(scale: float, shift: float) -> Surface:
-            found = Surface(
-                axes=tuple(one[self.kept] for one in self.nodes), times=forward, values=scale * data[0],
-                start_rates=-scale * data[1, :-1], end_rates=-scale * data[1, 1:],
-            )  # fmt: skip
-            return found.raised(shift)
+        whole = Surface(
+            axes=tuple(one[self.kept] for one in self.nodes), times=forward, values=data[0],
+            start_rates=-data[1, :-1], end_rates=-data[1, 1:],
+        )  # fmt: skip
+        return self.scaled(whole, below)
 
-        whole = made(1.0, 0.0)
-        if below:  # U may rise over 1 beside corners
-            return made(SMALL / max(1.0, top_of(whole)), -SMALL)
-        return made(SMALL / max(self.least(whole), 0.5), -SMALL)
+    def scaled(self, whole: Surface, below: bool) -> Surface:
+        """V = e (U - 1) from U itself."""
+        # U may rise over 1 beside corners
+        scale = SMALL / (max(1.0, top_of(whole)) if below else max(self.least(whole), 0.5))
+        return replace(
+            whole, values=scale * whole.values, start_rates=scale * whole.start_rates, end_rates=scale * whole.end_rates
+        ).raised(-SMALL)
 
 
 def ramp_of(cells: int) -> float:
