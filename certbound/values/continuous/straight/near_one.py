@@ -41,8 +41,8 @@ from certbound.watch import OutOfTime
 Proposed = tuple[Surface, Payment]
 Other = Callable[[float, float], Found]
 
-_RARE = math.log(1e-3)  # below that steps are finer, and what is lost is paid as a share of U, too
-_RAREST = math.log(1e-6)  # below that logarithms are proposed at once
+_RARE = math.log(1e-3)  # below that logarithms serve better and need the time; lower bounds come after them
+_RAREST = math.log(1e-6)  # below that there are none of those
 _FEWEST, _MOST = 14, 60  # cells along each state
 _COARSE = 0.55  # of the cells that may be afforded, for a first grid
 _COST = 0.01  # about the seconds of both sides, over cells^2
@@ -83,10 +83,10 @@ def bound_between(
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
     level = rough_level(inner)
     if not served or not _RARE < level < 0:
-        found = other(time.perf_counter() + granted, wanted)
-        if not served or not _RAREST < level <= _RARE or outer is None or found[0] <= wanted or wanted == math.inf:
-            return found
-        return _with_rare(problem, model, outer, granted, level, found)
+        logs = other(time.perf_counter() + granted, wanted)
+        if not served or not _RAREST < level <= _RARE or outer is None or logs[0] <= wanted or wanted == math.inf:
+            return logs
+        return _with_rare(problem, model, outer, granted, level, logs)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below = list[Proposed](), list[Proposed]()
     most = min(math.sqrt(_SHARE * granted / _COST), _MOST)
@@ -183,8 +183,8 @@ def _bounded(
         else:
             payment, proof = proved_upper(surface, model, starts, (), spare)
             needed = np.where(proof.ranges.low < 0, proof.ranges.residual_high, 0.0)
-        if shares is not None and (found := relative_below(proof)) is not None:
-            shares.append(found)
+        if shares is not None and (share := relative_below(proof)) is not None:
+            shares.append(share)
         if payment is not None and (best is None or (payment.log - best[1].log) * (1 if below else -1) > 0):
             best = surface if below else raised_above(surface), payment
         if factor is None or not np.isfinite(needed).all():

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Index
 from certbound.rigor.intervals import Interval, exp, log
 from certbound.values.continuous.hypotheses import Proof
 from certbound.values.continuous.payment import Levels, Terms, bound_below
@@ -42,7 +42,7 @@ def relative_below(proof: Proof) -> float | None:
     whole, begun, ended = log(Interval.point(1.0) - Interval.point(less)), grown(need.start), grown(least)
     if ended.lo <= 0:
         return None
-    lam, eps = _rates(excess, grown(np.maximum(proof.ranges.low, least)).lo, proof.slab, surface.slabs, begun.lo)
+    lam, eps = _rates(excess, grown(np.maximum(proof.ranges.low, least)).lo, proof.slab, surface.slabs, float(begun.lo))
     spare = need.spare * (1 + math.exp(need.start - least)) * _UP  # -R is at most that where nothing was looked at
     terms = Terms(
         levels=_NONE, lam=lam, eps=(eps + spare) / float(begun.lo) * _UP, steps=surface.steps,
@@ -52,7 +52,7 @@ def relative_below(proof: Proof) -> float | None:
     return found if found > -math.inf else None
 
 
-def _rates(excess: Array, low: Array, slab: Array, slabs: int, begun: Array) -> tuple[Array, Array]:
+def _rates(excess: Array, low: Array, slab: Index, slabs: int, begun: float) -> tuple[Array, Array]:
     """lam and eps of each slab with -R <= lam W + eps, W >= ``low``, on its patches, the cheapest at W = ``begun``."""
     lam, eps = np.zeros(slabs), np.zeros(slabs)
     for k in np.unique(slab):
