@@ -14,10 +14,11 @@ from certbound.errors import InfeasibleError
 from certbound.values.continuous import exits, straight
 from certbound.values.continuous.curved import bounding
 from certbound.values.continuous.held_faces import check_noise
-from certbound.values.continuous.hypotheses import Model, prove_lower, prove_upper
+from certbound.values.continuous.hypotheses import Model, prove_lower, prove_upper, proved_lower
 from certbound.values.continuous.plane import Plane, plane_of
 from certbound.values.continuous.room import safe_room, starts_of
 from certbound.values.continuous.straight import near_one, ramps
+from certbound.values.continuous.straight.relative import relative_below
 
 
 def free() -> cb.Problem:
@@ -135,3 +136,20 @@ def test_where_the_drift_leads_back_fast_few_cells_do() -> None:
     lows = [float(one.range_at(0)[0].min()) / ramps.SMALL + 1 for one in found]
     assert lows[0] < -0.1  # it rings
     assert lows[1] > -0.02
+
+
+def test_where_failing_is_rare_a_share_of_u_is_paid() -> None:
+    """The same proposal, paid by amounts and by shares: both below the truth, also where starts are spoilt upwards."""
+    odd = 2 * np.arange(30) + 1.0
+    stays = 4 / np.pi * float(np.sum((-1.0) ** np.arange(30) / odd * np.exp(-((0.6 * np.pi * odd) ** 2) / 8)))
+    truth, (inner, model) = math.log(1 - stays**2), plane(free())
+    surface = ramps.Ramps(inner, 8, 0.1, below=True, finely=True).surface(None, below=True)
+    found = []
+    for lift in (0.0, 2e-4):
+        payment, proof = proved_lower(surface.raised(lift), model, inner.starts, negligible=1e-6)
+        share = relative_below(proof)
+        assert payment is None or payment.log <= truth
+        assert share is None or share <= truth
+        found.append((payment, share))
+    assert found[0][1] is not None
+    assert found[0][1] > (-math.inf if found[0][0] is None else found[0][0].log) - 1e-3

@@ -80,12 +80,13 @@ class Model:
 class Proof:
     """What the residual inequality says about one surface: ranges of the patches that were looked at.
 
-    ``slab`` and ``cell`` say which these are; the cells of a slab are numbered in the order of `Surface.patches`.
+    ``slab`` and ``cell`` say which (in the order of `Surface.patches`), ``seen`` what was looked at, and what for.
     """
 
     ranges: Ranges
     slab: Index
     cell: Index
+    seen: tuple[Surface, Need] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -134,8 +135,8 @@ def examine(
         return ends[0] * per + kept, ranges
 
     found = [one for one in side_by_side(look, list(surface.chunks())) if one is not None]
-    patch = np.concatenate([np.empty(0, dtype=np.intp), *(index for index, _ in found)])
-    return Proof(ranges=joined([ranges for _, ranges in found]), slab=patch // per, cell=patch % per)
+    patch, ranges = np.concatenate([np.empty(0, dtype=np.intp), *(one[0] for one in found)]), [one[1] for one in found]
+    return Proof(ranges=joined(ranges), slab=patch // per, cell=patch % per, seen=(surface, need))
 
 
 def joined(ranges: Sequence[Ranges]) -> Ranges:
@@ -270,7 +271,7 @@ def chart_above(
 ) -> list[Chart]:
     """Upper bounds of P(leaving the box from a cell on), at the start of each of the ``slabs``, or ``near`` the starts.
 
-    One payment is made for each of the ``levels`` (of log P), at which it is then sharp; every cell takes the best.
+    One payment is made for each of the ``levels`` (of log P), where it is sharp; every cell takes the best.
     """
     surface = raised_above(surface, held)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=0.0)
@@ -300,15 +301,15 @@ def prove_lower(
 
 def proved_lower(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
-    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (),
+    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (), near: Array | None = None,
 ) -> tuple[Payment | None, Proof]:
-    """The same with what was seen, where some start lies in the grid; ``negligible`` stands for `NEGLIGIBLE`."""
+    """The same with what was seen, if a start is in the grid; ``near`` is that of `examine`."""
     surface = _sunk(surface)
     start = -up(-extreme_over(surface, starts, upper=False, points=points))
     ends = [surface.face_range(axis, side)[1] for axis, sides in enumerate(cut) for side in (0, 1) if sides[side]]
     end = max(float(surface.range_at(-1)[1].max()), *ends, -math.inf)
     need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf, bottom=end)
-    proof = examine(surface, model, need, upper=False)
+    proof = examine(surface, model, need, upper=False, near=near)
     return _earned(proof, need, surface, start, end), proof
 
 

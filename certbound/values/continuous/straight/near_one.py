@@ -7,6 +7,7 @@ shrinks by its factor from one pass to the next. The last one is bounded on ever
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -30,15 +31,18 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
+from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
+from certbound.values.continuous.straight.relative import relative_below
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]
 Other = Callable[[float, float], Found]
 
-_RARE = math.log(1e-3)  # below that, logarithms serve better and need the time
+_RARE = math.log(1e-3)  # below that logarithms serve better and need the time; lower bounds come after them
+_RAREST = math.log(1e-6)  # below that there are none of those
 _FEWEST, _MOST = 14, 60  # cells along each state
 _COARSE = 0.55  # of the cells that may be afforded, for a first grid
 _COST = 0.01  # about the seconds of both sides, over cells^2
@@ -46,6 +50,9 @@ _SHARE = 0.58  # of what may be spent, for the finer grid
 _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noises: lower bounds need more
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
+_GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0)  # both where failing is rare
+_BELOW = 0.43  # of what may be spent, for a lower bound then
+_SPARED = 0.03  # of U, which need not be carried then
 _VAIN = 0.1  # of the cost, of a proposal that is not proved
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
 _WORSE = 1.5  # times the least one of those before: sources do not help any more
@@ -76,7 +83,10 @@ def bound_between(
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
     level = rough_level(inner)
     if not served or not _RARE < level < 0:
-        return other(time.perf_counter() + granted, wanted)
+        logs = other(time.perf_counter() + granted, wanted)
+        if not served or not _RAREST < level <= _RARE or outer is None or logs[0] <= wanted or wanted == math.inf:
+            return logs
+        return _with_rare(problem, model, outer, granted, level, logs)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below = list[Proposed](), list[Proposed]()
     most = min(math.sqrt(_SHARE * granted / _COST), _MOST)
@@ -117,18 +127,44 @@ def bound_between(
     return min(upper, log[0]), least, f"{words} and {log[2].rpartition('cells: ')[2]}", (above, below)
 
 
+def _with_rare(
+    problem: Problem, model: Model, outer: Plane, granted: float, level: float, found: Found
+) -> Found:
+    """The lower bound that may be had where failing is rare, beside what is ``found``."""
+    upper, lower, words, proposed = found
+    if lower is not None and upper - lower < _ENOUGH:
+        return found
+    cells = max(round(math.sqrt(_BELOW * granted / _COST)), _FEWEST)
+    shares = list[float]()
+    with contextlib.suppress(OutOfTime):
+        _bounded(outer, model, cells, level, points_of(problem), below=True, shares=shares)
+    best = max(shares, default=-math.inf)
+    if best <= (-math.inf if lower is None else lower):
+        return found
+    return upper, best, f"{words}, {cells}^2 below", proposed
+
+
 def _pair(ends: tuple[float, ...]) -> tuple[float, float]:
     return ends[0], ends[1]
 
 
 def _bounded(
-    plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool
+    plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool,
+    shares: list[float] | None = None,
 ) -> Proposed | None:
-    """The best bound of a few proposals: corrected by samples of the residual, then by its bounds."""
+    """The best bound of a few proposals: corrected by samples of the residual, then by its bounds.
+
+    ``shares`` gets the bounds of log P by `relative_below` (lower ones only), which no certificate states.
+    """
+    rare = shares is not None
     starts, kinds = plane.starts, list[tuple[float, float, Ramps, Surface, Source | None]]()
     for eased in (False, True):
-        solver = Ramps(plane, cells, ramp_of(cells) * plane.horizon, _MARGIN[below], eased=eased, below=below)
-        surface, source, value, promised = _corrected(solver, model, points, below)
+        solver = Ramps(
+            plane, cells, ramp_of(cells) * plane.horizon, _MARGIN[below], eased=eased, below=below, finely=rare
+        )
+        if eased and solver.plain:  # the same again
+            break
+        surface, source, value, promised = _corrected(solver, model, points, below, rare)
         if surface is not None and 0 < value < 1 and abs(promised - value) < _MUCH * value:
             kinds.append((promised, value, solver, surface, source))
             if promised > 0 and abs(math.log(promised) - level) < _LIKELY:
@@ -137,15 +173,18 @@ def _bounded(
         return None
     _, value, solver, surface, source = (max if below else min)(kinds, key=lambda one: one[0])
     best: Proposed | None = None
-    for factor in (*_AGAIN, None):
+    for factor in (*(_GENTLY[1] if rare else _AGAIN), None):
         spare = NEGLIGIBLE * SMALL * value
         payment: Payment | None
+        near = SMALL * _SPARED / plane.horizon * _least(surface) if rare else None
         if below:
-            payment, proof = proved_lower(surface, model, starts, points, spare, plane.cut)
+            payment, proof = proved_lower(surface, model, starts, points, spare, plane.cut, near)
             needed = -proof.ranges.residual_low
         else:
             payment, proof = proved_upper(surface, model, starts, (), spare)
             needed = np.where(proof.ranges.low < 0, proof.ranges.residual_high, 0.0)
+        if shares is not None and (share := relative_below(proof)) is not None:
+            shares.append(share)
         if payment is not None and (best is None or (payment.log - best[1].log) * (1 if below else -1) > 0):
             best = surface if below else raised_above(surface), payment
         if factor is None or not np.isfinite(needed).all():
@@ -153,6 +192,8 @@ def _bounded(
         table = np.zeros((surface.slabs, surface.cells[0] * surface.cells[1]))
         table[proof.slab, proof.cell] = np.maximum(needed, 0.0) / SMALL
         table = table.reshape(surface.slabs, *surface.cells)
+        if rare:
+            table = np.maximum(table - _SPARED / plane.horizon * _least(surface), 0.0)
         if table.max(axis=(1, 2)) @ surface.steps < _LEFT * value:
             break
         source = _more(source, surface, factor * table)
@@ -161,13 +202,13 @@ def _bounded(
 
 
 def _corrected(
-    solver: Ramps, model: Model, points: Array | None, below: bool
+    solver: Ramps, model: Model, points: Array | None, below: bool, rare: bool = False
 ) -> tuple[Surface | None, Source | None, float, float]:
     """The proposal that promises most, its source, U at the starts and about the bound."""
     plane, source = solver.plane, None
     best: tuple[Surface | None, Source | None, float, float] = None, None, 0.0, math.inf
     sign, least = -1 if below else 1, math.inf
-    for factor in (*_FACTORS, None):
+    for factor in (*(_GENTLY[0] if rare else _FACTORS), None):
         surface = solver.surface(source, below=below)
         if not covers(surface, plane.horizon, plane.low, plane.high, within=not below):
             break
@@ -176,6 +217,10 @@ def _corrected(
         asked = level > -SMALL if below else level < 0  # where 0 < U < 1
         needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / SMALL
         paid = float(needed.max(axis=(1, 2)) @ surface.steps)
+        if rare:  # as a share of U and what it is at the starts
+            share = needed / (_least(surface) + value)
+            paid = min(paid, 2 * value * float(share.max(axis=(1, 2)) @ surface.steps))
+            needed = np.maximum(needed - _SPARED / plane.horizon * _least(surface), 0.0)
         if not math.isfinite(paid) or value <= 0:
             break
         if best[0] is None or sign * (value - best[3]) + paid < 0:
@@ -190,3 +235,9 @@ def _corrected(
 def _more(source: Source | None, surface: Surface, needed: Array) -> Source:
     more = Source.above(surface, needed)
     return more if source is None else source.plus(more)
+
+
+def _least(surface: Surface) -> Array:
+    """The least U of each patch, 0 where it is less."""
+    low = [value_range(surface.patches(*chunk))[0] for chunk in surface.chunks()]
+    return np.maximum(1 + np.concatenate(low) / SMALL, 0.0).reshape(surface.slabs, *surface.cells)

@@ -50,6 +50,7 @@ _RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a
 _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
 _LONGEST = 8  # steps of the horizon, at least
+_FINELY = 24  # the same where failing is rare
 _CLOSELY = 0.25  # correlated: a wider box
 _PAST = 0.05  # d: how far beyond 0 and 1 U is where it is given up
 _ZONE = 6  # cells at a face where the drift back is weakened
@@ -73,13 +74,14 @@ class Ramps:
     """The collocated equation on a grid; U is kept as the coefficients of its splines.
 
     ``plane`` must not depend on time and have one branch. Where noises go together, the box in which the equation is
-    solved is larger by ``margin`` times their correlation, in cells beside a face.
+    solved is larger by ``margin`` times their correlation, in cells beside a face. ``finely`` asks for shorter steps.
     """
 
     def __init__(
-        self, plane: Plane, cells: int, lead: float, margin: float = 0.0, *, eased: bool = False, below: bool = False
+        self, plane: Plane, cells: int, lead: float, margin: float = 0.0, *, eased: bool = False, below: bool = False,
+        finely: bool = False,
     ) -> None:
-        self.plane, self.lead = plane, lead
+        self.plane, self.lead, self.longest = plane, lead, _FINELY if finely else _LONGEST
         nodes = [self.grid(axis, Plan(cells=cells, growth=_GROWTH, lead=lead)) for axis in (0, 1)]
         shared = _correlation(plane, nodes)
         wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
@@ -95,6 +97,7 @@ class Ramps:
         on[0, [0, -1]] = on[1, :, [0, -1]] = 1
         share, lost = plane.counted(x, y, 0.0 if wider else 1.0)
         led = share if below else np.ones(x.shape)
+        plain = force, led
         if eased:
             force, led = self._eased(force, a, led, x, y, below)
         own = [[csr_matrix(table) for table in one.dense] for one in self.splines]
@@ -109,6 +112,8 @@ class Ramps:
         met = on.sum(axis=0).ravel()
         moves = ((met == 0) | (share.ravel() > 0)).astype(float)  # not on faces that are no limits
         drawn, lost = -_PAST if below else 1 + _PAST, eased * moves * lost.ravel()
+        given = (one * np.ones(np.shape(other)) for one, other in zip(plain, (force, led)))
+        self.plain = not lost.any() and all(map(np.array_equal, given, (force, led)))
         self.operator = csr_matrix(diags(moves) @ self.operator - diags(lost) @ self.mass)
         self.count = met * led.ravel() * moves
         self.edge, self.inner = np.flatnonzero(met), np.flatnonzero(met == 0)
@@ -156,7 +161,7 @@ class Ramps:
     def surface(self, source: Source | None, *, below: bool) -> Surface:
         """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
         horizon, shift = self.plane.horizon, 0.0 if below else SHIFT * self.lead
-        times, first = _times(horizon, shift, self.lead)
+        times, first = _times(horizon, shift, self.lead, self.longest)
         sign = -1.0 if below else 1.0
         given = None if source is None else sign * self.fed(source)
         value = self.first
@@ -277,11 +282,11 @@ def _at(times: Array, values: Array, t: float) -> Array:
     return np.asarray((1 - share) * values[left] + share * values[left + 1]).ravel()
 
 
-def _times(horizon: float, shift: float, lead: float) -> tuple[Array, int]:
+def _times(horizon: float, shift: float, lead: float, longest: int) -> tuple[Array, int]:
     """Ends of the steps, one of them at ``shift`` and the last one at shift + horizon, and the first one's number."""
     step, steps = _FIRST * lead, [_FIRST * lead]
     while sum(steps) < horizon + shift:
-        while 2 * step <= min(_GROWTH * (sum(steps) + 2 * _FIRST * lead), horizon / _LONGEST):
+        while 2 * step <= min(_GROWTH * (sum(steps) + 2 * _FIRST * lead), horizon / longest):
             step *= 2
         steps.append(step)
     times = np.concatenate([[0.0], np.cumsum(steps)])
