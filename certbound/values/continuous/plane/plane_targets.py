@@ -95,7 +95,7 @@ def proved_above(surface: Surface, aim: Aim, negligible: float = NEGLIGIBLE) -> 
         late = float(surface.range_at(-1)[0][fate.alive].min(initial=0.0))
         missing = -min(0.0, late, *_on_faces(surface, fate, _FACES)[0])
         surface = surface.raised(up(missing)) if missing > 0 else surface
-    if missing > 0 or fate.alive.all():
+    if missing > 0 or fate.alive.all() or not fate.alive.any():
         return surface, Payment(log=0.0), None
     start = up(extreme_over(surface, aim.plane.starts, upper=True))
     need = Need(spare=negligible / float(surface.times[-1]), start=start, top=0.0)
