@@ -52,6 +52,7 @@ _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0)  # both where failing is rare
 _BELOW = 0.43  # of what may be spent, for a lower bound then
+_FINE = 30  # cells along each state, without which nothing comes of it
 _SPARED = 0.03  # of U, which need not be carried then
 _VAIN = 0.1  # of the cost, of a proposal that is not proved
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
@@ -134,8 +135,9 @@ def _with_rare(
     upper, lower, words, proposed = found
     if lower is not None and upper - lower < _ENOUGH:
         return found
-    cells = max(round(math.sqrt(_BELOW * granted / _COST)), _FEWEST)
-    shares = list[float]()
+    cells, shares = round(math.sqrt(_BELOW * granted / _COST)), list[float]()
+    if cells < _FINE:
+        return found
     with contextlib.suppress(OutOfTime):
         _bounded(outer, model, cells, level, points_of(problem), below=True, shares=shares)
     best = max(shares, default=-math.inf)
