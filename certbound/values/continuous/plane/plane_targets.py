@@ -68,6 +68,7 @@ _FACTORS = (0.6, 0.9, 1.12, 1.12, 1.5, 3.0)  # of the residual, for one source a
 _SAMPLED = 3  # of which samples tell
 _WORSE = 3.0  # times the least residual of those before: sources do not help any more
 _COST, _MOST = 0.009, 56  # seconds of both sides, over cells^2, and most cells
+_BELOW = (28, 20, 16)  # cells for lower bounds, one after the other: on finer grids sources feed each other
 _DEEP = 0.25  # of the box's width: how deep the box reaches into a target that takes up one of its sides
 
 
@@ -294,9 +295,9 @@ def bound_failing(
     above, below = list[Proposed](), list[Proposed]()
     if target.form.axial and aims[0].plane.autonomous and len(model.branches) == 1:
         cells = min(max(round(math.sqrt(patches / RATE / _COST)), _FEWEST), _MOST)
-        for aim, kept in zip(aims, (above, below)):
+        for aim, kept, number in ((aims[0], above, cells), *((aims[1], below, n) for n in _BELOW if n <= cells)):
             with contextlib.suppress(OutOfTime, RuntimeError, ValueError):  # a singular system, numbers that overflow
-                found = _corrected(aim, likely(aim.plane, target, cells, aim.upper))
+                found = None if kept else _corrected(aim, likely(aim.plane, target, number, aim.upper))
                 kept += [] if found is None else [found]
         upper = min((one[1].log for one in above), default=0.0)
         lower = max((one[1].log for one in below), default=-math.inf)
