@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import keyword
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -163,7 +164,10 @@ def pick(coordinates: Any, dimension: int) -> tuple[int, ...] | None:
     """Distinct state indices, as many as the set has dimensions."""
     if coordinates is None:
         return None
-    result = tuple(int(index) for index in coordinates)
+    try:
+        result = tuple(map(operator.index, coordinates))
+    except TypeError:
+        raise TypeError(f"`coordinates` must be indices of states, counted from 0, got {coordinates!r}.") from None
     if len(result) != dimension or len(set(result)) != len(result) or any(index < 0 for index in result):
         raise ValueError(f"`coordinates` must be {dimension} distinct state indices, got {coordinates!r}.")
     return result

@@ -18,7 +18,8 @@ from certbound.parallel import crew, result_of
 from certbound.watch import poll, undisturbed
 
 _ROOT = float(np.sqrt(2.0))
-_LONG, _GRACE = 1e6, 0.3  # squared sizes of all inequalities beyond which a copy of this process solves; seconds
+_LONG = 2e5  # squared sizes of all inequalities beyond which a copy of this process solves: a second and more
+_GRACE = 0.3, 0.3  # seconds, and of the limit, after which such a copy is ended: what is nearly found is waited for
 _SETTLED = ("Solved", "PrimalInfeasible", "DualInfeasible", "MaxTime")
 
 
@@ -114,10 +115,10 @@ class Program:
         right = np.concatenate(self.constants)
         if sum(float(len(one)) ** 2 for one in self.constants) < _LONG:
             return self._solved(objective, matrix, right, seconds)
-        until = time.perf_counter() + seconds + _GRACE
+        until = time.monotonic() + _GRACE[0] + (1.0 + _GRACE[1]) * seconds  # nobody counts what a copy works
         with crew(1) as workers:  # one step of the solver may outlast the limit, and nothing in this process ends it
             workers.begin(0, lambda: self._solved(objective, matrix, right, seconds))
-            while time.perf_counter() < until:
+            while time.monotonic() < until:
                 for _, answer in workers.finished():
                     return cast("Array | None", result_of(answer))
                 poll()

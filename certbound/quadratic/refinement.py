@@ -18,7 +18,7 @@ from certbound.quadratic.corners import Cells, Dynamics, curved_axes, grid
 from certbound.quadratic.inequality import corner_levels, prove
 from certbound.quadratic.mirror_images import Mirror, mirrors
 from certbound.quadratic.setting import Setting, make_setting, refuse
-from certbound.quadratic.surroundings import moved_sides, working_box
+from certbound.quadratic.surroundings import moved_sides, working_boxes
 from certbound.quadratic.wall_attempts import (
     APART,
     NOTHING,
@@ -41,7 +41,6 @@ _LOOSE, _LARGE = 0.1, 0.5  # remainders, in working boxes within the horizon: sm
 _SINGLE = 0.6  # of the time of a group's program that one wall's takes
 _FIRST_SLABS, _FEWER_SLABS, _SMALL_DIMENSION = 8, 4, 4  # at first, up to so many states and beyond
 _MOST_ENTRIES = 1.1e6  # of the matrix inequalities of a program
-_MARGINS = (4.0, 7.0, 2.5)
 _GAIN = 0.03  # of a wall's logarithm: a refinement that gains less is not repeated
 _DONE = 1e-3  # share of the bound that a wall may have without being looked at again
 _LEAST = 1e-300
@@ -50,6 +49,7 @@ _SAME = 0.02  # of the logarithm: what a mirrored bound may lose
 _HOPE, _SLABS = 0.3, 0.7  # of the logarithm: what pieces and windows, or slabs, gain where nothing is known
 _AGAIN = 0.6  # of what a refinement gained: what it gains once more
 _RESCUES = 2  # refinements of a wall that proves nothing, before the working box is given up
+_HOPELESS = 8.0  # the logarithm of such a wall's bound beyond which they are not tried
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -122,7 +122,7 @@ def bound_quadratic(
         raise InfeasibleError(f"quadratic value bounds serve at most {_MOST_STATES} states, the problem has {n}.")
     refuse(problem)
     quest = _Quest(problem, target, seconds, found)
-    if before is not None and before.search is not None:
+    if before is not None and before.search is not None and before.search.worst < math.inf:  # else it had no time
         quest.best, quest.chosen = before, before.search
     return quest.run()
 
@@ -142,7 +142,7 @@ class _Quest:
 
     def run(self) -> QuadraticBound:
         seconds = self.until - self.begin
-        for low, high in _boxes(self.problem) if self.best is None else ():
+        for low, high in working_boxes(self.problem) if self.best is None else ():
             left = self.until - time.perf_counter()
             if self.best is not None and (left <= seconds / 2 or self.best.upper < 0):
                 break
@@ -150,7 +150,7 @@ class _Quest:
         if self.best is None or self.chosen is None:
             raise self.failure or InfeasibleError("no working box was found.")
         self._move()
-        if self.best.upper > _log10(self.target):
+        if self.best.upper > _log10(self.target) and self.chosen.worst <= _HOPELESS:
             self.chosen.run(self.target, self.until - time.perf_counter(), self._note)
         spent = time.perf_counter() - self.begin
         return replace(self.best, seconds=spent, search=self.chosen)
@@ -187,15 +187,6 @@ class _Quest:
             self.best = bound
             if bound.upper < 0:
                 self.found(bound)
-
-
-def _boxes(problem: Problem) -> list[tuple[Array, Array]]:
-    """Different working boxes, in the order in which they are tried."""
-    found: dict[bytes, tuple[Array, Array]] = {}
-    for margin in _MARGINS:
-        low, high = working_box(problem, margin)
-        found.setdefault(low.tobytes() + high.tobytes(), (low, high))
-    return list(found.values())
 
 
 def make_search(problem: Problem, low: Array, high: Array, *, together: bool = False) -> Search:
@@ -245,17 +236,24 @@ class Search:
                 break
             self._solve(attempt, until)
             for _ in range(_RESCUES):
-                if self.attempts[place].level < 0 or not self._refined(self._option(place, until), until):
+                hope = 0.0 <= self.attempts[place].found <= _HOPELESS
+                if not (hope and self._refined(self._option(place, until), until)):
                     break
             if not self.attempts[place].level < 0:
                 break
         level, parts = total(self.attempts)
         yield self._answer(level)
         place = len(self.attempts) - 1
-        unsettled = _log10(target) < level / math.log(10) < 0 and self.attempts[place].others
+        near = level < 0 or all(one.level < 0 for one in self.attempts)  # with the sides apart the sum may be below 1
+        unsettled = near and level / math.log(10) > _log10(target) and self.attempts[place].others
         large = parts[place] >= level + math.log(_DONE)
         if unsettled and large and self._refined(self._option(place, until), until):
             yield self._answer(total(self.attempts)[0])
+
+    @property
+    def worst(self) -> float:
+        """The largest logarithm at a wall, above 0 too; infinite where one has none."""
+        return max((attempt.found for attempt in self.attempts), default=0.0)
 
     def run(self, target: float, share: float, found: Callable[[QuadraticBound], object]) -> None:
         """Refine the wall that counts most until the target or the time is reached; each better bound is told."""

@@ -14,6 +14,7 @@ from certbound.quadratic.setting import Setting, diffusion_of, never_crossed, sa
 from certbound.rigor.intervals import Interval
 
 _PATHS, _STEPS, _SEED = 160, 300, 20
+_MARGINS = (4.0, 7.0, 2.5)
 _ROOMY = 1.05  # a ball's sides are moved out by this, so that they are no walls
 _LEAST = 0.3  # least margin as a share of what the paths cover
 _SHARE = 0.25  # of the bound that the box's own sides may cost together
@@ -23,6 +24,12 @@ _FAR = 1.75  # what the margin is multiplied by along coordinates in which the m
 _NEARLY = 1.25
 _CLEAR = 0.1  # least distance from the starts, in half widths of the box
 _NEAR = 1.5  # own sides are taken up to this multiple of the distance at which a side would be chosen
+
+
+def working_boxes(problem: Problem) -> list[tuple[Array, Array]]:
+    """Different working boxes, in the order in which they are tried."""
+    found = [working_box(problem, margin) for margin in _MARGINS]
+    return list({low.tobytes() + high.tobytes(): (low, high) for low, high in found}.values())
 
 
 def working_box(problem: Problem, margin: float) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -115,6 +116,41 @@ def test_a_refinement_of_what_bounds_nothing_counts_by_how_far_it_is() -> None:
     assert attempt.gains[0] == attempt.found - search.attempts[0].found
 
 
+def told_levels(monkeypatch: pytest.MonkeyPatch, alone: float, together: float) -> list[str]:
+    """Every wall has these levels, by itself or with all others; which of them are asked for."""
+    asked: list[str] = []
+
+    def solve(self: refinement.Search, attempt: Attempt, until: float) -> None:
+        asked.append(attempt.wall.label)
+        level = together if len(attempt.others) > 3 else alone
+        attempt.proved, attempt.seconds = SimpleNamespace(level=level), 1e-3  # type: ignore[assignment]  # all it has
+
+    monkeypatch.setattr(refinement.Search, "_solve", solve)
+    monkeypatch.setattr(refinement.Search, "by_wall", lambda self: (np.full(8, -8.0), -4.0))
+    return asked
+
+
+def test_sides_whose_sum_with_the_obstacle_is_beyond_1_are_taken_apart_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = told_levels(monkeypatch, -4.0, -0.01)
+    problem = problem_of()
+    ball = cb.Outside(cb.Ball([1.1, 1.1], 0.2, coordinates=[0, 1]))
+    problem = problem.replace(safe=[*problem.safe, ball])
+    search = make_search(problem, *working_box(problem, 4.0), together=True)
+    first, second = (bound.upper for bound in search.first(0.5, 10.0))
+    assert first == 0
+    assert len(asked) == 2 + 3  # a below, a above, b and c, as the model is affine along them
+    assert second < 0
+
+
+def test_a_bound_that_is_far_from_saying_anything_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = told_levels(monkeypatch, 9.0, 9.0)
+    best = bound_quadratic(problem_of(), seconds=100.0)
+    assert best.upper == 0
+    assert len(asked) == len(refinement.working_boxes(problem_of()))
+    assert bound_quadratic(problem_of(), seconds=100.0, before=best).upper == 0
+    assert len(asked) == len(refinement.working_boxes(problem_of()))
+
+
 def test_sides_move_to_where_they_cost_a_share() -> None:
     problem = problem_of()
     low, high = working_box(problem, 4.0)
@@ -145,7 +181,7 @@ def test_better_bounds_are_told_and_the_end_of_the_time_is_kept() -> None:
 
 def test_a_search_goes_on_from_an_earlier_one(monkeypatch: pytest.MonkeyPatch) -> None:
     first = bound_quadratic(problem_of(), target=0.999, seconds=20.0)
-    monkeypatch.setattr(refinement, "_boxes", lambda problem: pytest.fail("the first pass was made again"))
+    monkeypatch.setattr(refinement, "working_boxes", lambda problem: pytest.fail("the first pass was made again"))
     later = bound_quadratic(problem_of(), before=first, seconds=1.0)
     assert later.upper <= first.upper < 0
 

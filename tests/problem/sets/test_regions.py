@@ -123,6 +123,13 @@ def test_a_ball_in_twelve_dimensions_is_sampled_uniformly():
     assert np.mean((radii / 2) ** 12) == pytest.approx(0.5, abs=0.02)
 
 
+def test_coordinates_are_positions_and_nothing_is_cut_to_one():
+    for wrong in (["a", "b"], "ab", [0, 1.5], 3):
+        with pytest.raises(TypeError, match="`coordinates` must be indices of states, counted from 0, got"):
+            Ball([0, 0], 1, coordinates=wrong)
+    assert Ball([0, 0], 1, coordinates=np.array([2, 0])).coordinates == (2, 0)
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
