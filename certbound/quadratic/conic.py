@@ -18,7 +18,7 @@ from certbound.parallel import crew, result_of
 from certbound.watch import poll, undisturbed
 
 _ROOT = float(np.sqrt(2.0))
-_LONG = 2e5  # squared sizes of all inequalities beyond which a copy of this process solves: a second and more
+_LONG = 4e5  # squared sizes of all inequalities beyond which a copy of this process solves: seconds
 _GRACE = 0.3, 0.3  # seconds, and of the limit, after which such a copy is ended: what is nearly found is waited for
 _SETTLED = ("Solved", "PrimalInfeasible", "DualInfeasible", "MaxTime")
 
