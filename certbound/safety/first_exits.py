@@ -120,8 +120,8 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
     Parameters
     ----------
     problem : Problem
-        One state, limits on both sides that stand still over the whole horizon, a model that does not depend on time,
-        and a set of starts.
+        One state, limits that stand still over the whole horizon, a model that does not depend on time, and a set of
+        starts.
     times : sequence of float, optional
         Where the curves are wanted; those of the value functions when omitted.
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import certbound as cb
 from certbound.cli.app import run
@@ -11,6 +12,8 @@ from certbound.errors import InfeasibleError
 from certbound.problem.files import save
 from certbound.safety import first_exits
 from certbound.values.continuous import bound_mean_time, bound_rate
+from certbound.values.continuous.hypotheses import chart_below
+from certbound.values.continuous.line import ladder, maps
 from certbound.watch import OutOfTime
 
 
@@ -35,6 +38,50 @@ def found():
         patch.setattr(first_exits, "_SHORTEST", 1)
         patch.setattr(first_exits, "_STEP", 0.01)
         return cb.bound_exit_times(brownian())
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_a_limit_on_one_side_is_enough(monkeypatch, near):
+    """A share that falls below 80 from 100: the first passage of its logarithm, in closed form (reflection).
+
+    Where the line is cut near by, leaving there is a failure for upper bounds alone.
+    """
+    asked = []
+    monkeypatch.setattr(maps, "chart_below", lambda *args: asked.append(args) or chart_below(*args))
+    if near:
+        monkeypatch.setattr(maps, "cuts_of", lambda *_: (80.0, 112.0))
+    monkeypatch.setattr(first_exits, "_SHORTEST", 1)
+    monkeypatch.setattr(first_exits, "_STEP", 0.04)
+    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[:1] * 3)
+    system = cb.ContinuousSystem(lambda x: 0.05 * x, states=["S"], diffusion=lambda x: [[0.2 * x[0]]])
+    problem = cb.Problem(system, initial=[100], safe=[cb.Inside(cb.HalfSpace([-1], -80))], horizon=1.0)
+    found = cb.bound_exit_times(problem)
+    times = found.times[found.times > 0.4]
+    rate, away = 0.05 - 0.2**2 / 2, np.log(100 / 80)
+    above, below = ((sign * away - rate * times) / (0.2 * np.sqrt(times)) for sign in (-1, 1))
+    truth = norm.cdf(above) + np.exp(-2 * rate * away / 0.2**2) * norm.cdf(-below)
+    lower, upper = (np.array([found.at(float(s))[k] for s in times]) for k in (0, 1))
+    assert len(times) > 10
+    assert np.all((lower < truth) & (truth < upper))
+    assert np.all((0.9 * truth < lower) & (upper < 1.1 * truth)) or near
+    assert 0.3 < found.mean_lower < 1
+    assert [args[-1] for args in asked] == [[(False, True)]]
+    assert found.mean_upper is None  # some never do
+
+
+def test_leaving_through_a_cut_is_no_failure_whatever_is_proposed(monkeypatch):
+    """A proposal that counts both faces proves nothing of leaving through the lower one by itself."""
+    asked = []
+    monkeypatch.setattr(maps, "chart_below", lambda *args: asked.append(args) or chart_below(*args))
+    monkeypatch.setattr(first_exits, "_SHORTEST", 1)
+    monkeypatch.setattr(first_exits, "_STEP", 0.04)
+    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[:1] * 3)
+    cb.bound_exit_times(brownian(1.0))
+    assert asked[0][-1] == [(False, False)]
+    plain, cut = (chart_below(*asked[0][:-1], [(False, side)])[0] for side in (False, True))
+    middle = np.array([[0.0]])
+    assert plain.at(middle, up=False)[0] > np.log10(0.9 * (1 - survival(1.0, 0.0, 0.0)))
+    assert cut.at(middle, up=False)[0] < np.log10(0.5 * (1 - survival(1.0, 0.0, 0.0)))
 
 
 @pytest.mark.slow

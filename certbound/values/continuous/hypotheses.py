@@ -306,8 +306,7 @@ def proved_lower(
     """The same with what was seen, if a start is in the grid; ``near`` is that of `examine`."""
     surface = _sunk(surface)
     start = -up(-extreme_over(surface, starts, upper=False, points=points))
-    ends = [surface.face_range(axis, side)[1] for axis, sides in enumerate(cut) for side in (0, 1) if sides[side]]
-    end = max(float(surface.range_at(-1)[1].max()), *ends, -math.inf)
+    end = surface.highest_end(cut)
     need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf, bottom=end)
     proof = examine(surface, model, need, upper=False, near=near)
     return _earned(proof, need, surface, start, end), proof
@@ -327,13 +326,14 @@ def _earned(proof: Proof, need: Need, surface: Surface, start: float, end: float
 
 
 def chart_below(
-    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None
+    surface: Surface, model: Model, levels: Sequence[float], slabs: Sequence[int], near: Near = None,
+    cut: Sequence[Sides] = (),
 ) -> list[Chart]:
-    """Lower bounds of P(leaving the box from a cell on), as `chart_above`; -inf where nothing was proved."""
+    """Lower bounds of P(leaving the box from a cell on), as `chart_above`, but not through a mere ``cut``."""
     surface = _sunk(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=np.inf)
     proof = examine(surface, model, need, upper=False)
-    found = [_earned(proof, need, surface, level, float(surface.range_at(-1)[1].max())) for level in levels]
+    found = [_earned(proof, need, surface, level, surface.highest_end(cut)) for level in levels]
     paid = [payment.terms for payment in found if payment is not None and payment.terms is not None]
     charts = []
     for time, k, axes, values in surface.readings(slabs, near, up=False):

@@ -208,6 +208,11 @@ class Surface:
         slack = 2.0**-53 * (1000 + 40 * off) * (patches.size + np.abs(patches.reference))
         return np.where(inside, patches.reference + value - slack, -np.inf)
 
+    def highest_end(self, cut: Sequence[tuple[bool, bool]] = ()) -> float:
+        """Upper bound of V at the last time, and at the faces of each state that ``cut`` names."""
+        faces = [self.face_range(axis, side)[1] for axis, sides in enumerate(cut) for side in (0, 1) if sides[side]]
+        return max(float(self.range_at(-1)[1].max()), *faces, -math.inf)
+
     def face_range(self, axis: int, side: int) -> tuple[float, float]:
         """Bounds of V on one face of the grid over all times."""
         low, high = self.face_ranges(axis, side)

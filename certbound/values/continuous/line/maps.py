@@ -54,7 +54,8 @@ def chart_line(problem: Problem, model: Model, levels: list[float], times: int, 
     links = ladder.surfaces_below(outer, start, rough, (share, fineness, 0.5 * tolerance, lead)) if lower else None
     if links is not None and spans(links, upper=False):
         surface = links[0].surface
-        below = _at_times(model, surface.times, times, 1, partial(chart_below, surface, outer.models[0], levels))
+        chart = partial(chart_below, surface, outer.models[0], levels, cut=[_cut(outer)])
+        below = _at_times(model, surface.times, times, 1, chart)
     return Charts(upper=tuple(above), lower=tuple(below))
 
 
@@ -92,7 +93,7 @@ def chart_slabs(problem: Problem, model: Model, step: float, last: float) -> Cha
     if below is not None and spans(below, upper=False):
         surface = below[0].surface
         slabs = np.flatnonzero(surface.times[:-1] <= last).tolist()
-        lower = chart_below(surface, outer.models[0], levels, slabs, near)
+        lower = chart_below(surface, outer.models[0], levels, slabs, near, [_cut(outer)])
     return Charts(upper=tuple(upper), lower=tuple(lower))
 
 
@@ -102,20 +103,19 @@ def _rooms(problem: Problem, model: Model) -> tuple[ladder.Room, ladder.Room, St
     held = ladder.held_in(problem, model, start)
     cuts = cuts_of(problem, model, start, held)
     inner, outer = (ladder.room_of(problem, model, cuts, start, held, inner=side) for side in (True, False))
-    if any(_changing(room) for room in (inner, outer)) or start.random:
+    if not (ladder.is_plain(inner) and ladder.is_plain(outer)) or start.random:
         raise InfeasibleError(
-            "maps of value functions serve limits on both sides that stand still over the whole horizon, and a set of "
-            "starts."
+            "maps of value functions serve limits that stand still over the whole horizon, and a set of starts."
         )
     phase = outer.phases[0]
     check_noise(outer.models[0], (phase.start, phase.end), [(phase.low, phase.high)], [phase.held])
     return inner, outer, start
 
 
-def _changing(room: ladder.Room) -> bool:
-    """Whether the limits move, come or go in time, or one is missing."""
+def _cut(room: ladder.Room) -> tuple[bool, bool]:
+    """The sides on which the line is only cut: a path that leaves there has not failed."""
     phase = room.phases[0]
-    return not ladder.is_plain(room) or not all(end or held for end, held in zip(phase.closed, phase.held))
+    return not (phase.closed[0] or phase.held[0]), not (phase.closed[1] or phase.held[1])
 
 
 def _at_times(
