@@ -166,15 +166,15 @@ class Work:
         check_end(problem, "a step by step induction")
         if problem.horizon > _MOST_STEPS:
             raise Inapplicable(f"a step by step induction takes at most {_MOST_STEPS} steps, not {problem.horizon}.")
-        self.problem, self.target, self.n, self.since = problem, target, system.dimension, since
+        self.problem, self.target, self.n, self.since, self.until = problem, target, system.dimension, since, until
         self.horizon, self.ending = int(problem.horizon), target if since == 0 and until is None else None
-        self.until = until
         asked = problem.constraints  # which refuses a problem with a target of its own
         self.limits = problem.safe if problem.ending else asked
         self.beyond = 0.0 if problem.ending else 1.0
         self.dynamics = dynamics_of(problem, parts)
         self.shocks = noise_of(problem, self.dynamics)
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
+        self.beyond_below = 0.0 if self.boxes.cut else self.beyond
         self.random = problem.initial.random
         self.start_shocks = self._start_shocks()
         self._last: tuple[object, AnyTransition] | None = None
@@ -262,7 +262,7 @@ class Work:
         last = self.horizon
         zones = [self.zones(grid, t) for t, grid in enumerate(grids)]
         above = final(grids[last], zones[last], above=True, beyond=self.beyond)
-        below = final(grids[last], zones[last], above=False, beyond=0.0 if self.boxes.cut else self.beyond)
+        below = final(grids[last], zones[last], above=False, beyond=self.beyond_below)
         yield last, above, below
         for t in range(last - 1, end - 1, -1):
             poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
@@ -280,14 +280,15 @@ class Work:
             plain, done, undone = replace(zones, has_target=False), zones.done, zones.undone
             kept = replace(plain, safe=zones.safe & done, unsafe=zones.unsafe | undone)
             if t == self.horizon:
-                high, low = (final(grid, kept, above=side, beyond=self.beyond) for side in (True, False))
+                ends = ((True, self.beyond), (False, self.beyond_below))
+                high, low = (final(grid, kept, above=side, beyond=value) for side, value in ends)
             else:
                 step = self._kept_transition(t, grid, grids[t + 1], share)
                 high, low = back_above(step, high, kept), back_below(step, low, kept)
             if t == until:
                 nodal, bend, every = 0.0 * high.nodal, 0.0 * high.bend, np.ones(grid.shape)
-                failed = assembled(grid, nodal, bend, every > 0, every, self.beyond)
-                above, below = jointly(failed, high, done), jointly(failed, low, ~undone)
+                failed = [assembled(grid, nodal, bend, every > 0, every, b) for b in (self.beyond, self.beyond_below)]
+                above, below = jointly(failed[0], high, done), jointly(failed[1], low, ~undone)
             elif t < until:  # W is at least V
                 above = jointly(back_above(step, above[0], plain, *above[1:]), high, ~undone)
                 below = jointly(back_below(step, below[0], plain, *below[1:]), low, done)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Integers
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Outside, Quadratic, Region
@@ -24,8 +24,11 @@ from certbound.values.sets import active_at, box_around
 _COARSE = {1: 256, 2: 32, 3: 12}  # cells along each side when the reach of a step is bounded
 
 
+_MOST_PLACES = 1e7  # along an axis
 _PATHS = 400
-_BEYOND, _FARTHER = 0.6, 15.0  # how far beyond simulated paths a line is cut: of their extent, and sizes of the noise
+_PAST = 6.0  # sizes of normal noise beyond a limit that most paths which break it keep to
+_SMALLER = 0.9  # times the boxes that states surely keep to, below which boxes that end before are taken
+_BEYOND, _FARTHER = 0.6, 15.0  # how far beyond simulated paths space is cut: of their extent, and sizes of the noise
 
 
 class Boxes:
@@ -39,11 +42,16 @@ class Boxes:
         Upper bound of the probability that a path leaves a box through a side that no constraint has put there.
     cut : bool
         Whether the boxes, which reach beyond all limits, end where hardly a path gets to: from below such paths count
-        as safe.
+        as safe, from above as failing.
     """
 
     def __init__(self, low: Array, high: Array, leak: float, *, cut: bool = False) -> None:
         self.low, self.high, self.leak, self.cut = low, high, leak, cut
+
+    @property
+    def volume(self) -> float:
+        """Of all steps together."""
+        return float(np.prod(self.high - self.low, axis=1).sum())
 
 
 def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
@@ -60,8 +68,24 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
     ends = np.array([box_around(active_at(problem.constraints, t), n, t) for t in range(horizon + 1)])
     low, high = ends[:, 0], ends[:, 1]
     lacking = np.flatnonzero(~np.isfinite(ends).all(axis=(1, 2)))  # steps without some side
-    if len(lacking) and (shocks.laplace or shocks.steps is not None):
-        return _cut_line(problem, shocks, low.min(), high.max())
+    limits = low.min(axis=0), high.max(axis=0)
+    if not len(lacking) or shocks.sizes is not None:
+        return _reached(problem, shocks, dynamics, (low, high), lacking)
+    cut = _cut(problem, shocks, *limits)
+    if shocks.laplace or shocks.steps is not None:
+        return cut
+    try:
+        reached = _reached(problem, shocks, dynamics, (low, high), lacking)
+    except Inapplicable:  # the worst cases of all steps lead far beyond what any path does
+        return cut
+    return cut if cut.volume < _SMALLER * reached.volume else reached
+
+
+def _reached(
+    problem: Problem, shocks: Shocks, dynamics: Dynamics, ends: tuple[Array, Array], lacking: Integers
+) -> Boxes:
+    """The limits of each step, and where the states surely are in steps that have none."""
+    (low, high), n, horizon = ends, problem.system.dimension, int(problem.horizon)
     far = max(REACH, shocks.reach)
     spread = far * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
     reach = start_box(problem)
@@ -81,30 +105,30 @@ def boxes_of(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> Boxes:
     return Boxes(low, high, leak)
 
 
-def _cut_line(problem: Problem, shocks: Shocks, low: float, high: float) -> Boxes:
-    """One interval for all steps: beyond simulated paths where nothing bounds the state, and beyond all limits."""
+def _cut(problem: Problem, shocks: Shocks, low: Array, high: Array) -> Boxes:
+    """One box for all steps: beyond simulated paths where nothing bounds a state, and beyond all limits."""
     system, hull = problem.system, start_box(problem)
     assert isinstance(system, DiscreteSystem)
-    rng, horizon = np.random.default_rng(0), int(problem.horizon)
+    rng, horizon, n = np.random.default_rng(0), int(problem.horizon), system.dimension
     disturbance = problem.system.disturbance
     middle = [] if disturbance is None else list((disturbance.low + disturbance.high) / 2)
-    step, x = compile_numpy(problem.closed_loop), rng.uniform(*hull, (_PATHS, 1))[:, 0]
-    least, most = float(x.min()), float(x.max())
+    step, x = compile_numpy(problem.closed_loop), rng.uniform(*hull, (_PATHS, n))
+    least, most = x.min(axis=0), x.max(axis=0)
     for t in range(horizon):
         inputs = [] if problem.input_sequence is None else list(problem.input_sequence[t])
-        noise = system.noise.sample(rng, _PATHS)[:, 0] * float(system.noise_matrix[0, 0])
-        x = np.broadcast_to(step(float(t), x, *inputs, *middle)[..., 0], x.shape) + noise
-        x = np.where((x >= low) & (x <= high), x, hull[0])
-        least, most = min(least, float(np.nanmin(x))), max(most, float(np.nanmax(x)))
-    scale = float(shocks.sigma.hi[0])
-    room = _BEYOND * (most - least) + min(shocks.reach, _FARTHER) * scale
-    beyond = shocks.reach * scale * (1 + 1e-9)
-    first = least - room if np.isinf(low) else low - beyond
-    last = most + room if np.isinf(high) else high + beyond
-    ends = np.array([[first], [last]])
-    _check_box(problem, ends[0], ends[1], 0, np.array([scale * shocks.reach]))
+        noise = system.noise.sample(rng, _PATHS) @ system.noise_matrix.T
+        with np.errstate(all="ignore"):
+            x = np.broadcast_to(step(float(t), *x.T, *inputs, *middle), x.shape) + noise
+        x = np.where(np.all((x >= low) & (x <= high), axis=1, keepdims=True), x, hull[0])
+        least, most = np.minimum(least, x.min(axis=0)), np.maximum(most, x.max(axis=0))
+    scale, far = np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2), max(REACH, shocks.reach)
+    room = _BEYOND * (most - least) + min(far, _FARTHER) * scale
+    beyond = max(shocks.reach, _PAST) * scale * (1 + 1e-9)
+    first = np.where(np.isinf(low), least - room, low - beyond)
+    last = np.where(np.isinf(high), most + room, high + beyond)
+    _check_box(problem, first, last, 0, scale * far)
     steps = (horizon + 1, 1)
-    return Boxes(np.tile(ends[0], steps), np.tile(ends[1], steps), 0.0, cut=True)
+    return Boxes(np.tile(first, steps), np.tile(last, steps), 0.0, cut=True)
 
 
 def _of_domain(problem: Problem, spread: Array) -> Boxes:
@@ -199,6 +223,7 @@ def grid_of(
         if target is not None:
             widths, more = _finer(Outside(target), i, places, widths, share / 3 * float(shocks.sigma.mid[i]), t)
             marks += more
+        widths = np.maximum(widths, (high[i] - low[i]) / _MOST_PLACES)  # more are refused anyway
         axes.append(graded_axis(float(low[i]), float(high[i]), places, widths, marks))
     return Grid(axes=tuple(axes))
 

@@ -10,8 +10,8 @@ from scipy.stats import beta, norm
 
 import certbound as cb
 from certbound.problem.model.evaluation import compile_numpy
-from certbound.values.discrete import layout
-from certbound.values.discrete.failures import bound_failure
+from certbound.values.discrete import failures, layout
+from certbound.values.discrete.failures import Work, bound_failure
 from certbound.values.discrete.layout import without_hopeless
 from certbound.values.discrete.shocks import Inapplicable
 from certbound.values.sets import box_around
@@ -218,6 +218,33 @@ def test_a_state_without_a_constraint_is_followed_as_far_as_it_can_get() -> None
     assert found.lower <= high
 
 
+def test_a_state_without_limits_is_cut_where_paths_do_not_get_to() -> None:
+    """The worst cases of all steps lead across a pole at n = -1, and no path goes there."""
+    system = cb.DiscreteSystem(
+        lambda a, n: [0.9 * a + 0.1 * a * n / (1 + n), n + 0.1 * (1 - n)], states=["a", "n"],
+        noise=cb.Gaussian(std=[0.1, 0.1]),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([0.2], [1.4], coordinates=[0]))]
+    problem = cb.Problem(system, initial=[0.5, 1.0], safe=safe, horizon=8, delta=0.5)
+    found = bound_failure(problem, seconds=1.0, ratio=1.5)
+    low, high = limits(problem, 20_000, 0)
+    assert 0 < found.lower < high
+    assert low < found.upper < 1
+
+
+def test_what_passes_a_cut_is_safe_from_below_and_fails_from_above(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Boxes that end right beside the start: most paths pass their ends, and none has failed."""
+    system = cb.DiscreteSystem(lambda x, y: [0.5 * x, 0.5 * y], states=["x", "y"], noise=cb.Gaussian(std=[0.3, 0.3]))
+    safe = [cb.Inside(cb.Box([-1.0], [1.0], coordinates=[0]))]
+    problem = cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=3, delta=0.5)
+    boxes = layout.Boxes(np.tile([-2.8, -0.2], (4, 1)), np.tile([2.8, 0.2], (4, 1)), 0.0, cut=True)
+    monkeypatch.setattr(failures, "boxes_of", lambda *_: boxes)
+    work = Work(problem, None, 1)
+    upper, lower = work.bounds(work.layout(0.33), 0.33)
+    low, high = limits(problem, 20_000, 0)
+    assert lower < high < 0.5 < upper
+
+
 def test_wider_sets_shorter_horizons_and_less_noise_are_never_worse() -> None:
     base = bound_failure(scalar(horizon=5), ratio=1.01)
     for better in (
@@ -235,7 +262,7 @@ def test_where_the_model_is_undefined_counts_as_failing() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"safe": [cb.Inside(cb.Box([-np.inf], [1]))], "f": lambda x: 1e9 * x}, "has none at step"),
+        ({"safe": [cb.Inside(cb.Box([-np.inf], [1]))], "f": lambda x: 1e9 * x}, "more than"),
         ({"noise": cb.Gaussian(std=0.0)}, "noise of its own"),
         ({"noise": cb.Rademacher(scale=0.1)}, "Rademacher"),
         ({"noise": cb.Bounded(halfwidth=0.1)}, "class of laws"),
