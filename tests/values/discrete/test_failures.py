@@ -241,7 +241,7 @@ def test_what_passes_a_cut_is_safe_from_below_and_fails_from_above(monkeypatch: 
     monkeypatch.setattr(failures, "boxes_of", lambda *_: boxes)
     work = Work(problem, None, 1)
     upper, lower = work.bounds(work.layout(0.33), 0.33)
-    low, high = limits(problem, 20_000, 0)
+    _, high = limits(problem, 20_000, 0)
     assert lower < high < 0.5 < upper
 
 
