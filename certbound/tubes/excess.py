@@ -45,9 +45,12 @@ def log_excess(a: Array, b: float, z: Array, *, bessel: bool = False) -> tuple[A
         index = np.flatnonzero(chosen)
         if not len(index):
             continue
-        terms = int(np.max(last[index])) if sum_up is _direct else 64
-        for block in np.array_split(index, -(-len(index) * terms // _CHUNK)):
-            value[block], slope[block] = sum_up(a[block], b, z[block], peak[block], width[block], terms, bessel)
+        count = last[index].astype(int) if sum_up is _direct else np.full(len(index), 64)
+        size = np.floor(2 * np.log2(count))  # what needs few terms is not summed over as many as what needs most
+        for one in np.unique(size):
+            alike, terms = index[size == one], int(np.max(count[size == one]))
+            for block in np.array_split(alike, -(-len(alike) * terms // _CHUNK)):
+                value[block], slope[block] = sum_up(a[block], b, z[block], peak[block], width[block], terms, bessel)
     return value.reshape(shape), slope.reshape(shape)
 
 

@@ -10,14 +10,18 @@ import base64
 import json
 import zlib
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
+from flint import arb
 
 import certbound as cb
-from certbound.checker import check_data, parse
+from certbound.checker import Report, check, check_data, parse
+from certbound.checker.claims import prove
 from certbound.safety.answers import exact
 from certbound.safety.certificate import certificate_text, problem_data, restated
 from tests.checker import conftest
@@ -174,18 +178,36 @@ def _stated(build: Callable[[], cb.Problem], method: str) -> Callable[[], str]:
     return text
 
 
+_PROVED: dict[str, arb] = {}  # of what ``_sharp`` has written
+
+
 def _sharp(written: Callable[[], str]) -> Callable[[], str]:
     """A certificate by value functions that claims what is proved of it, and no more."""
 
     def text() -> str:
-        found = written()
-        report = check_data(parse(found))
+        found, seen = written(), []
+
+        def looked(*args: Any, **options: Any) -> arb:
+            seen.append(prove(*args, **options))
+            return seen[-1]
+
+        with patch.object(check, "prove", looked):
+            report = check_data(parse(found))
         lower = report.log10_lower is not None
         proved = report.log10_lower_proved if lower else report.log10_proved
         assert proved is not None
-        return restated(found, proved, lower=lower)
+        sharp = restated(found, proved, lower=lower)
+        (_PROVED[sharp],) = seen
+        return sharp
 
     return text
+
+
+def report_of(base: str) -> Report:
+    """What the checker says of a certificate; another claim changes nothing of what is proved of the same numbers."""
+    known = _PROVED.get(text(base))
+    with nullcontext() if known is None else patch.object(check, "prove", lambda *_, **__: known):
+        return check_data(parse(text(base)))
 
 
 _BASES: dict[str, Callable[[], str]] = {

@@ -19,7 +19,7 @@ from tests.checker import (  # noqa: F401  # they enter themselves
     value_forgeries,
     window_forgeries,
 )
-from tests.checker.forgeries import FORGERIES, forged, text
+from tests.checker.forgeries import FORGERIES, forged, report_of, text
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "certificate.md"
 SECONDS = 2.0
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("kept_tables")
 
 @pytest.mark.parametrize("base", sorted({forgery.base for forgery in FORGERIES.values()}))
 def test_what_is_forged_is_proved_before(base: str) -> None:
-    report = check_data(parse(text(base)))
+    report = report_of(base)
     assert report.valid, report.reason
 
 

@@ -154,7 +154,7 @@ def test_a_killed_run_goes_on_with_the_same_table(tmp_path: Path) -> None:
     process.wait()
     kept = file.read_bytes().count(b"\n") - 1
     assert 2 <= kept < 6
-    found = cb.sweep("ou", over, method="linear", jobs=2, resume=file)
+    found = cb.sweep("ou", over, method="linear", jobs=1, resume=file)
     assert len(found.points) == 6
     assert untimed(found) == untimed(cb.sweep("ou", over, method="linear", jobs=1))
 

@@ -44,6 +44,14 @@ def test_the_excess_agrees_with_ball_arithmetic(a, b, z, bessel):
     assert scalar == pytest.approx(expected, rel=1e-11, abs=1e-11)
 
 
+@pytest.mark.parametrize("bessel", [False, True])
+def test_each_of_many_arguments_gets_the_terms_that_it_needs(bessel):
+    a, z = (part.ravel() for part in np.meshgrid([0.3, 4.0, 50.0], np.geomspace(1e-3, 400.0, 30)))
+    many = np.array(log_excess(a, 1.5, z, bessel=bessel))
+    alone = [[float(part[0]) for part in log_excess(a[[k]], 1.5, z[[k]], bessel=bessel)] for k in range(len(z))]
+    np.testing.assert_allclose(many.T, alone, rtol=1e-13, atol=1e-13)
+
+
 @pytest.mark.parametrize(("a", "b", "z", "bessel"), CASES[::3])
 def test_the_inverse_returns_the_argument(a, b, z, bessel):
     target = reference(a, b, z, bessel)

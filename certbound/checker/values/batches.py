@@ -205,8 +205,7 @@ def mul(x: Batch, y: Batch) -> Batch:
     """x y, without the terms beyond the degree, which lie in the error."""
     which = x.terms
     coefficients = np.zeros_like(x.coefficients)
-    mine = [bool(row.any()) for row in x.coefficients]
-    yours = [bool(row.any()) for row in y.coefficients]
+    mine, yours = (list(np.any(z.coefficients, axis=1)) for z in (x, y))
     for i, j, k in which.kept:
         if mine[i] and yours[j]:
             coefficients[k] += x.coefficients[i] * y.coefficients[j]

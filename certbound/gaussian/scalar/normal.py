@@ -88,11 +88,11 @@ def mills(x: Array) -> Array:
     cell = (near * _CELLS).astype(np.intp)
     table = _mills_table()
     u = near - (cell + 0.5) / _CELLS
-    value = table[_DEGREE].take(cell)
-    term = np.empty_like(value)
+    small = table.take(cell, axis=1) if cell.size < 4096 else None  # of few numbers all coefficients at once
+    value, term = table[_DEGREE].take(cell), np.empty_like(u)
     for k in range(_DEGREE - 1, -1, -1):
         value *= u
-        value += table[k].take(cell, out=term, mode="clip")
+        value += table[k].take(cell, out=term, mode="clip") if small is None else small[k]
     far = x >= _FAR
     if np.any(far):
         large = x[far]

@@ -58,6 +58,7 @@ def test_mills_ratio_keeps_its_stated_relative_error():
     x = np.concatenate([rng.uniform(0, 20, 400), np.arange(0, 129) / 8, [15.999999999999998, 1e3, 1e8]])
     value = mills(x)
     assert [float(mills(point)) for point in x] == value.tolist()  # one number takes a way of its own
+    assert np.array_equal(mills(np.tile(x, 8)), np.tile(value, 8))  # and so do many
     assert mills(np.array([[np.nan]])).tolist() == [[mills(np.zeros(1))[0]]]
     for point, got in zip(x.tolist(), value.tolist()):
         z = flint.arb(point)
