@@ -82,6 +82,8 @@ class Watch:
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
         if isinstance(jobs, bool) or int(jobs) != jobs or jobs < 1:
             raise ValueError(f"`jobs` must be a positive number of processes, got {jobs!r}.")
+        if progress is not None and not callable(progress):
+            raise TypeError(f"`progress` must be a function of what is being done, got {progress!r}.")
         self.jobs, self.executor, self.patient = int(jobs), executor, patient
         self.limit, self._progress, self._clock = limit, progress, clock
         self.started = clock()

@@ -63,8 +63,7 @@ def test_a_limit_waits_for_a_module_that_is_being_loaded(tmp_path: Path, monkeyp
     (tmp_path / "slow_to_load.py").write_text("import time\ntime.sleep(0.15)\nwhole = True\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(OutOfTime), Clock(0.01).running():
-        __import__("slow_to_load")
-        time.sleep(5)
+        assert __import__("slow_to_load") is time.sleep(5)
     assert sys.modules.pop("slow_to_load").whole
 
 
