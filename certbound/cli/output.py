@@ -135,8 +135,12 @@ def logging_to_stderr(*, verbose: bool) -> Iterator[None]:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all: an interrupted run leaves the old file as it was."""
+    """Write a file whole or not at all: an interrupted run leaves the old file as it was; so do links and devices stay."""
     data = content.encode() if isinstance(content, str) else content
+    if path.exists() and not path.is_file():  # a device or a pipe
+        path.write_bytes(data)
+        return
+    path = Path(os.path.realpath(path))
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as stream:
