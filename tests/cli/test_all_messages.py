@@ -102,6 +102,7 @@ LINES = [
     ("verify ou --plot a.png --report a.png", "twice"), ("simulate ou --paths 1e300", "paths"),
     ("sweep ou --over sigma=0.1:1:1e9", "at most 1000000"), ("sweep ou --over sigma=nan,1", "sigma"),
     ("new a --example pendulm", "pendulum"), ("check folder.npz", "folder.npz"), ("verify ou --delta 0,01", "--delta"),
+    ("sweep ou --over sigma=0.1,0.2 --resume --jobs", "--jobs"),
 ]  # fmt: skip
 
 
