@@ -22,6 +22,7 @@ from typing import Any
 _OFTEN = 0.25  # seconds between two reports that say nothing new
 _GRACE = 0.05  # of the limit, and seconds, after which a timer ends what does not poll
 _AGAIN = 1.0  # seconds after which it does so again, should its exception have been lost
+_SOON = 0.05  # the same where a module was being loaded
 
 
 class OutOfTime(BaseException):
@@ -81,6 +82,8 @@ class Watch:
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
         if isinstance(jobs, bool) or int(jobs) != jobs or jobs < 1:
             raise ValueError(f"`jobs` must be a positive number of processes, got {jobs!r}.")
+        if progress is not None and not callable(progress):
+            raise TypeError(f"`progress` must be a function of what is being done, got {progress!r}.")
         self.jobs, self.executor, self.patient = int(jobs), executor, patient
         self.limit, self._progress, self._clock = limit, progress, clock
         self.started = clock()
@@ -165,7 +168,12 @@ class Watch:
             yield
             return
 
+        loading = _loading(sys._getframe())
+
         def stop(number: int, frame: FrameType | None) -> None:
+            if _loading(frame) > loading:  # a library that is loaded by half is broken for good
+                signal.setitimer(signal.ITIMER_REAL, _SOON, _AGAIN)
+                return
             raise OutOfTime
 
         def lost(what: sys.UnraisableHookArgs) -> None:
@@ -213,6 +221,15 @@ class Watch:
     def remind(self, seconds: float, call: Callable[[], object]) -> None:
         """Interrupt the work at hand once, at a `poll` after so many seconds; what was to interrupt it does not."""
         self._alarm = (self._clock() + seconds, call)
+
+
+def _loading(frame: FrameType | None) -> int:
+    """How many imports are under way."""
+    count = 0
+    while frame is not None:
+        count += frame.f_code.co_filename.startswith("<frozen importlib")
+        frame = frame.f_back
+    return count
 
 
 _CURRENT: ContextVar[Watch | None] = ContextVar("certbound_watch", default=None)

@@ -207,6 +207,8 @@ def check_writable(*paths: Path | None, problem: str = "") -> None:
             raise InputError(f"`{path}` is the problem's own file, and would be lost", "name another file")
         if path.is_dir():
             raise InputError(f"`{path}` is a directory", "name a file")
+        if str(path).startswith("--"):
+            raise InputError(f"`{path}` stands where a file has to be named", f"name a file; ./{path} is one, too")
         if not path.parent.is_dir():
             raise InputError(f"the directory `{path.parent}` does not exist", f"run mkdir -p {path.parent}")
         if not os.access(path if path.exists() else path.parent, os.W_OK):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from certbound.checks import instance
 from certbound.problem.adapters import casadi_module, to_casadi
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
@@ -63,6 +64,7 @@ def export_casadi(problem: Problem) -> CasadiProblem:
     >>> float(nominal.dynamics(0, [2.0], [], [])), nominal.labels
     (-1.0, ('inside the ball of radius 1.5 around (0)',))
     """
+    instance("problem", problem, Problem)
     ca = casadi_module()
     system = problem.system
     t, h = ca.SX.sym("t"), ca.SX.sym("h")

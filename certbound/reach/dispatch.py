@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from certbound.checks import instance
 from certbound.constants.bounds import bound_constants
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, contained
 from certbound.parallel import alone
@@ -69,6 +70,7 @@ def bound_reach(
 
     Source: Thms K4, K5, K7 of theory.
     """
+    instance("problem", problem, Problem)
     if method in _STATISTICAL:
         return statistical_reach(problem, method, noise=noise, cells=cells, **sampling)
     if method not in ("auto", *_ENGINES):

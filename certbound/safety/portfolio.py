@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from certbound.checks import instance
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Proof, Request
@@ -32,6 +33,7 @@ from certbound.safety.engines import (
     quadratic_engine,
     values_engine,
 )
+from certbound.tubes.constants import Constants
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -222,6 +224,7 @@ def check_request(problem: Problem, request: Request) -> None:
     constants = request.constants
     if constants is None:
         return
+    instance("constants", constants, Constants)
     if constants.continuous != continuous:
         raise ValueError(f"`constants` must state a {'rate' if continuous else 'gain'}, as the problem's time asks.")
     if constants.times is not None and constants.times[-1] < problem.horizon:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
+from certbound.checks import instance
 from certbound.constants.bounds import bound_constants
 from certbound.errors import InfeasibleError
 from certbound.problem.goals import check_end
@@ -107,6 +108,7 @@ class Planner:
         feedback: str | ArrayLike | None = None,
         steps: int | None = None,
     ) -> None:
+        instance("problem", problem, Problem)
         system = problem.system
         if system.inputs is None:
             raise ValueError(

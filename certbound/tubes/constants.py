@@ -273,7 +273,10 @@ def _read_only(array: Array) -> Array:
 
 
 def _values(name: str, value: ArrayLike | None, times: Array | None) -> float | Array:
-    array = np.asarray(value, dtype=float)
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must hold numbers, got {value!r}.") from error
     if not np.all(np.isfinite(array)):
         raise ValueError(f"`{name}` must be finite, got {value!r}.")
     if array.ndim == 0:

@@ -50,12 +50,15 @@ def read_clearance(value: Any, horizon: float, name: str = "clearance", *, conti
             f"`{name}` must be a number or a pair (times, values), got a callable: nothing can be proved between "
             "its samples; give lower bounds that hold on pieces."
         )
-    if isinstance(value, tuple | list):
-        if len(value) != 2:
-            raise ValueError(f"`{name}` must be a number or a pair (times, values), got {len(value)} entries.")
-        times, values = (np.asarray(part, dtype=float) for part in value)
-    else:
-        values = np.asarray(value, dtype=float)
+    pair = isinstance(value, tuple | list)
+    if pair and len(value) != 2:
+        raise ValueError(f"`{name}` must be a number or a pair (times, values), got {len(value)} entries.")
+    try:
+        parts = [np.asarray(part, dtype=float) for part in (value if pair else [value])]
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must hold numbers, got {value!r}.") from error
+    times, values = parts[0], parts[-1]
+    if not pair:
         if values.ndim != 0:
             raise ValueError(f"`{name}` must be a number or a pair (times, values), got shape {values.shape}.")
         times, values = np.array([0.0, horizon]), values[None]

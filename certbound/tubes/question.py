@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from certbound.checks import instance
 from certbound.tubes.constants import Constants
 from certbound.tubes.objective import Clearance, Objective, make_objective, read_clearance
 from certbound.tubes.schedule import Schedule, make_schedule
@@ -49,6 +50,7 @@ class Question:
         ValueError, TypeError
             For a horizon, objective or clearance that cannot be, and a random start that nu does not cover.
         """
+        instance("constants", constants, Constants)
         schedule, start = make_schedule(constants, horizon), start or Start()
         continuous = schedule.continuous
         if clearance is None:

@@ -129,6 +129,14 @@ def test_a_certificate_with_a_wrong_frame_is_malformed(stepping, change: dict, w
         check_data({**stepping.data, **change})
 
 
+def test_a_path_ends_nowhere_without_a_domain(stepping) -> None:
+    """Else the last limit is taken for the domain, and breaking it for no failure."""
+    data = stepping.data
+    data["problem"] |= {"leaving": "ends", "domain": None}
+    with pytest.raises(CertificateError, match="where there is no `domain`"):
+        check_data(data)
+
+
 def test_every_truncation_is_refused(stepping) -> None:
     for length in range(0, len(stepping.text) - 2, max(1, len(stepping.text) // 40)):
         with pytest.raises(CertificateError):

@@ -102,6 +102,7 @@ LINES = [
     ("verify ou --plot a.png --report a.png", "twice"), ("simulate ou --paths 1e300", "paths"),
     ("sweep ou --over sigma=0.1:1:1e9", "at most 1000000"), ("sweep ou --over sigma=nan,1", "sigma"),
     ("new a --example pendulm", "pendulum"), ("check folder.npz", "folder.npz"), ("verify ou --delta 0,01", "--delta"),
+    ("sweep ou --over sigma=0.1,0.2 --resume --jobs", "--jobs"),
 ]  # fmt: skip
 
 
@@ -131,6 +132,18 @@ PYTHON: list[tuple[Callable[[], Any], str]] = [
     (lambda: cb.Constants(rate=1.0, sigma=-1.0, dimension=1), "sigma"),
     (lambda: cb.Constants(sigma=1.0, dimension=1), "rate"), (lambda: cb.load("nothing"), "nothing"),
     (lambda: cb.simulate_exits(problem(), paths=0, rng=np.random.default_rng(0)), "paths"),
+    (lambda: cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=1), "x of 1"),
+    (lambda: cb.ContinuousSystem(lambda x: sum(a for a, _ in [x]), states=3), "x of 3"),
+    (lambda: cb.verify_safety(problem(), constants=0.1), "constants"),  # type: ignore[arg-type]
+    (lambda: cb.verify_safety(problem(), progress=3), "progress"),  # type: ignore[arg-type]
+    (lambda: cb.Constants(rate="fast", sigma=1.0, dimension=1), "rate"),
+    (lambda: cb.tune_tube(0.1, horizon=1.0, delta=0.1), "constants"),  # type: ignore[arg-type]
+    (lambda: cb.bound_exit_probability(cb.Constants(rate=1.0, sigma=1.0, dimension=1), horizon=1.0, clearance="a"),
+     "clearance"),
+    (lambda: cb.bound_reach("ou"), "problem"), (lambda: cb.synthesize_plan("ou"), "problem"),  # type: ignore[arg-type]
+    (lambda: cb.SafetyFilter("ou"), "problem"), (lambda: cb.save("ou", "a.toml"), "problem"),  # type: ignore[arg-type]
+    (lambda: cb.export_casadi("ou"), "problem"),  # type: ignore[arg-type]
+    (lambda: cb.ConvexPlanner("ou", horizon=3), "problem"),  # type: ignore[arg-type]
 ]  # fmt: skip
 
 

@@ -58,6 +58,15 @@ def test_a_clock_stops_the_work_and_leaves_no_timer() -> None:
         assert Clock(None).left == float("inf")
 
 
+def test_a_limit_waits_for_a_module_that_is_being_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """cvxpy loaded by half had no attribute 'promote' for as long as the process went on."""
+    (tmp_path / "slow_to_load.py").write_text("import time\ntime.sleep(0.15)\nwhole = True\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(OutOfTime), Clock(0.01).running():
+        assert __import__("slow_to_load") is time.sleep(5)
+    assert sys.modules.pop("slow_to_load").whole
+
+
 def test_a_verdict_in_time_is_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
     words = ("verify", "ou", "--method", "kummer")
     assert answer(capsys, *words, "--time-limit", "60")[1].keys() == answer(capsys, *words)[1].keys()

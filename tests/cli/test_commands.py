@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 import certbound as cb
 from certbound.cli.app import app, run
+from certbound.cli.output import write_file
 
 VERIFY_KEYS = {
     "status", "log10_delta", "log10_lower", "delta", "margin", "time", "constraint", "reason", "method", "constants",
@@ -37,6 +39,22 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     assert lines[2].startswith("  try: ")
     assert "Traceback" not in captured.err
     return captured.err
+
+
+def test_what_is_written_leaves_links_and_devices_and_names_the_file(tmp_path: Path) -> None:
+    """`--certificate /dev/null` replaced the device, where root ran it."""
+    (tmp_path / "link").symlink_to("file")
+    write_file(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").read_text() == "new"
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    write_file(tmp_path / "pipe", "new")
+    assert os.read(reader, 9) == b"new"
+    os.close(reader)
+    assert (tmp_path / "pipe").is_fifo()
+    with pytest.raises(OSError, match=r"none/file'$"):
+        write_file(tmp_path / "none" / "file", "new")
 
 
 # ---- verify ------------------------------------------------------------------------------------------------

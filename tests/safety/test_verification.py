@@ -169,6 +169,13 @@ def test_no_noise_is_safe_with_certainty():
     assert verdict.log10_delta == -1e12
 
 
+def test_no_noise_is_safe_where_constants_hold_along_the_tube_alone():
+    """The room of a tube without width is none, and was refused as a ValueError."""
+    system = cb.ContinuousSystem(lambda x: [0.1 * x[0] - 0.2 * x[0] * x[1], 0.1 * x[1]], states=2)
+    problem = cb.Problem(system, initial=[1, 1], safe=[cb.Inside(cb.Box([0.5] * 2, [2] * 2))], horizon=1.0)
+    assert cb.verify_safety(problem, method="kummer").log10_delta == -1e12
+
+
 def test_stated_constants_are_named_as_an_assumption():
     problem = brownian()
     stated = cb.Constants(rate=-1.0, sigma=0.1, dimension=2)

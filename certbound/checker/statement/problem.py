@@ -161,6 +161,8 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     if record["leaving"] not in (None, "ends"):
         raise CertificateError(f"`{path}.leaving` must be \"ends\" or absent.")
     domain = _ranges(record["domain"], record.at("domain"), n) if record["domain"] is not None else None
+    if record["leaving"] is not None and domain is None:  # else the last limit would be taken for it
+        raise CertificateError(f"`{path}.leaving` must be absent where there is no `domain`.")
     constraints = [
         read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
         for index, item in enumerate(record.items("constraints", 0, 1000))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from certbound.checks import nearest, number
+from certbound.checks import instance, nearest, number
 from certbound.problem.files.plans import write_plan
 from certbound.problem.files.toml import toml_text
 from certbound.problem.foreign import restate
@@ -125,6 +125,7 @@ def save(problem: Problem, path: str | Path) -> None:
     """
     from certbound.problem.files.writing import content_of, networks_of
 
+    instance("problem", problem, Problem)
     target = Path(path)
     if target.suffix != ".toml":
         raise ValueError(f"`path` must end in .toml, got {str(path)!r}.")

@@ -81,6 +81,11 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
             "use NumPy's elementary functions on the entries (np.sin, np.where, np.maximum), or on x itself"
         )
         raise TypeError(f"`{name}` cannot be traced{_place(error)}: {error}; {cure}.") from error
+    except (IndexError, ValueError) as error:  # x[2] of two states, a, b = x of three
+        sizes = ", ".join(f"{key} of {len(arguments[key])}" for key in names if key != "t" and key in arguments)
+        raise ValueError(
+            f"`{name}` cannot be traced{_place(error)}: {str(error).rstrip('.')}; it was given {sizes or 'numbers'}."
+        ) from error
     return _finish(graph, result, name)
 
 

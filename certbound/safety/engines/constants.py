@@ -65,6 +65,8 @@ SEGMENTS, SEGMENTS_BY_NAME = 48, 16
 """Pieces of local constants: the paper's window bounds take time that grows with their square."""
 SHARES = (1.15, 1.6, 2.4, 4.0)
 """Room tried with local constants, in units of the tube at the target probability."""
+_HAIR = 1e-3
+"""Of the least room: what is left around the reach tube where no noise asks for any."""
 NEAR_MISS = 2.0
 """Metrics of their own for the constraints are tried where the tube takes at most so many times the room."""
 QUICK_BUDGET = 250
@@ -233,6 +235,8 @@ class _Work:
         except (CertboundError, ValueError):
             return
         needed = radius_over_pieces(tube, reach.curve)
+        if not needed.any():  # no noise: some room is asked for all the same
+            needed = needed + _HAIR * min(erosion.least.min(), 1.0)
         for share in SHARES:
             limit = share * needed
             if not reach.curve.continuous:

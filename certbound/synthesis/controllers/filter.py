@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
+from certbound.checks import instance
 from certbound.constants.matching import check_constants
 from certbound.errors import CertboundError
 from certbound.problem.adapters import casadi_module
@@ -127,6 +128,7 @@ class SafetyFilter:
         steady: bool = False,
         steps: int | None = None,
     ) -> None:
+        instance("problem", problem, Problem)
         if problem.system.disturbance is not None:
             raise ValueError("`problem` must have no disturbance for the filter: its noise-free state is not known.")
         if problem.initial.random:

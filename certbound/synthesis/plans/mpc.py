@@ -14,6 +14,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from certbound.checks import instance
 from certbound.constants.matching import check_constants
 from certbound.constants.stated import refuse_contradiction
 from certbound.errors import EnclosureError, InfeasibleError
@@ -104,6 +105,7 @@ def synthesize_plan(
     >>> result.feasible, result.status
     (True, 'SAFE')
     """
+    instance("problem", problem, Problem)
     began = time.perf_counter()
     if tube is not None:
         check_tube(problem, tube)
