@@ -6,8 +6,9 @@ step's end, near the wall (`Wall.margins`): after it has met the wall at the tim
 
 - *stay in a convex set*: the half-plane beyond a tangent at X_tau is unsafe. With probability at least 1/2 the noise of
   the rest of the step points into it or along it, and X_h is at most gamma h inside, gamma the largest inward drift.
-- *an obstacle O*: Y_t = X_t - (0, s (W_t - W_tau)) has the derivative f(X_t), so that its distance from O (from each of
-  its half-planes) grows at most at the rate of the outward drift. The noise of the rest has either sign with
+- *an obstacle along the coordinates* is not counted twice: what leaves it within the step is paid (``obstacles``).
+- *any other obstacle O*: Y_t = X_t - (0, s (W_t - W_tau)) has the derivative f(X_t), so that its distance from O (from
+  each of its half-planes) grows at most at the rate of the outward drift. The noise of the rest has either sign with
   probability 1/2 and exceeds `_FAR` standard deviations with probability 2 Phi(-`_FAR`): the sign that leads towards
   the middle of O keeps Y_h + (0, s (W_h - W_tau)) within what `Wall.margins` says.
 """
@@ -40,6 +41,20 @@ class Wall:
     region: Region
     outside: bool
     order: tuple[int, int]
+
+    def ends(self) -> tuple[Ends, Ends] | None:
+        """Exact ends of an obstacle along the coordinates, in (p, q); None for anything else."""
+        form = self.region.form
+        if not self.outside or not isinstance(form, Faces) or np.any(self.region.center_at()):
+            return None
+        if np.any(np.count_nonzero(form.normals, axis=1) != 1) or np.any(np.abs(form.normals).sum(axis=1) != 1):
+            return None
+        found = [[-math.inf, math.inf], [-math.inf, math.inf]]
+        for row, bound in zip(self.region.lifted(form.normals, 2)[:, list(self.order)], form.bounds):
+            place, sign = int(np.argmax(np.abs(row))), float(row.sum())
+            side = int(sign > 0)
+            found[place][side] = (max, min)[side](found[place][side], sign * float(bound))
+        return (found[0][0], found[0][1]), (found[1][0], found[1][1])
 
     def sizes(self, p: Interval, q: Interval) -> Interval:
         """g_j over boxes: shapes (N,) to (N, m)."""

@@ -29,6 +29,7 @@ from certbound.values.semilagrangian.local_steps import (
 )
 from certbound.values.semilagrangian.mirrors import mirrors_of
 from certbound.values.semilagrangian.noisy_axis import Setting
+from certbound.values.semilagrangian.obstacles import Way, tolls_of, ways_past
 from certbound.values.semilagrangian.remainders import bowed, level_of
 from certbound.watch import poll
 
@@ -67,7 +68,7 @@ def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Lay
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
     blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
     usable = blocks.known & _gentle(blocks, clock, axes)
-    marked = _marked(setting, clock, axes, blocks, usable)
+    marked = _marked(setting, clock, axes, blocks, usable, (index[0], index[1]), (edges[0], edges[1]))
     live = ~marked.broken & marked.boxed & usable[np.ix_(*index)]
     frame = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]), live)
     bands, live = _bands(frame, blocks, usable, (index[0], index[1]), (edges[0], edges[1]), clock)
@@ -76,9 +77,10 @@ def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Lay
     above, below, beyond = mirrors_of(setting, clock, axes, blocks, usable)
     level = np.maximum(levels_above(marked.safe & live, marked.crossed), beyond)
     everywhere = np.ones(level.shape, dtype=bool)
+    paid = marked.bent + tolls_of(setting, clock, frame, blocks, (_starts(index[0]), _starts(index[1])), marked.ways)
     return Layout(
         clock=clock, frame=frame, bands=bands,
-        above=Bounds(level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above, paid=marked.bent),
+        above=Bounds(level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above, paid=paid),
         below=bounds_below(live, marked.broken, reach, below),
     )  # fmt: skip
 
@@ -168,7 +170,8 @@ class _Marks:
 
     ``safe``: they lie in the safe set, far enough from p's faces; ``broken``: no point of theirs is safe; ``boxed``:
     within the box, or across its end where that is a limit; ``crossed``: a path may end there that has met a wall;
-    ``bent`` bounds the probability that a path leaves through a face of p within the step and ends far enough inside.
+    ``bent`` bounds the probability that a path leaves through a face of p within the step and ends far enough inside;
+    ``ways`` tell of the blocks from which an obstacle may be passed like that, wall by wall.
     """
 
     safe: Mask
@@ -176,9 +179,13 @@ class _Marks:
     boxed: Mask
     crossed: Mask
     bent: Array
+    ways: list[list[Way]]
 
 
-def _marked(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask) -> _Marks:
+def _marked(
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask, index: tuple[Index, Index],
+    edges: tuple[Array, Array],
+) -> _Marks:  # fmt: skip
     y, q = axes
     p, faces = setting.faces
     strays, bows = _strays(blocks, usable, p)
@@ -193,24 +200,35 @@ def _marked(setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: B
     boxed = boxed & ((places.lo >= p[0]) | math.isfinite(past[0])) & ((places.hi <= p[1]) | math.isfinite(past[1]))
     crossed = np.zeros(safe.shape, dtype=bool)
     nowhere = np.zeros((1, 1))
-    for wall in setting.walls:
-        sizes = wall.sizes(places.reshape(-1), heights.reshape(-1))
+    every, measured = [], [wall.sizes(places.reshape(-1), heights.reshape(-1)) for wall in setting.walls]
+    for wall, sizes in zip(setting.walls, measured):
         safe &= wall.safe(sizes, nowhere).reshape(safe.shape)
         broken |= wall.broken(sizes).reshape(safe.shape)
-        margins = _near_wall(setting, clock, axes, blocks, usable, wall)
+    first = [_starts(part)[:-1] for part in index]
+    asked = usable & np.logical_or.reduceat(np.logical_or.reduceat(safe, first[0]), first[1], axis=1)
+    for wall, sizes in zip(setting.walls, measured):
+        ways = ways_past(setting, clock, blocks, asked, edges, wall)
+        paid = np.any([way.paid for way in ways], axis=0) if ways else np.zeros_like(usable)
+        every.append(ways)
+        margins = _near_wall(setting, clock, axes, blocks, asked & ~paid, wall)
         near = np.isfinite(margins[0])
         kept = wall.safe(sizes, np.where(near, margins, 0.0).reshape(len(margins), -1)).reshape(safe.shape)
         crossed |= near & ~kept
     bent = np.zeros(safe.shape)
     for away, stray, bow in zip((places.lo - p[0], p[1] - places.hi), strays, bows):
         bent += _bent((away - stray) / bow) if bow > 0 else 0.0
-    return _Marks(safe=safe, broken=broken, boxed=np.asarray(boxed), crossed=crossed, bent=bent)
+    return _Marks(safe=safe, broken=broken, boxed=np.asarray(boxed), crossed=crossed, bent=bent, ways=every)
 
 
 def _bent(near: Array) -> Array:
     """`bowed` of the largest number of a table that is not above ``near``, from `SHORT` on."""
     table = np.geomspace(SHORT, 80 * SHORT, 150)
     return np.asarray(bowed(table, SHORT)[np.clip(np.searchsorted(table, near, side="right") - 1, 0, None)])
+
+
+def _starts(index: Index) -> Index:
+    """The first cell of every block, and the number of cells."""
+    return np.append(np.flatnonzero(np.diff(index, prepend=-1)), len(index))
 
 
 def _near_wall(

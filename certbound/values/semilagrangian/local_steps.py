@@ -11,6 +11,7 @@ import numpy as np
 from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval, concatenate, sq
+from certbound.values.grids import graded_axis
 from certbound.values.scouting import Scouted
 from certbound.values.semilagrangian.confines import Ends
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
@@ -191,6 +192,7 @@ SHORT = 0.3
 _MIRRORED = 6.0  # standard deviations beyond q's faces over which nodes are mirror images
 _COARSEST = (0.02, 2.5)  # cells along y over the width of the safe set, along q over the finest
 _GRADING = 0.12
+_BESIDE, _FINER = 1.5, 0.33  # deviations of q's noise beside an obstacle's end, and how much finer cells are there
 _SEEN = 1e-3  # a share of the visits that is worth fine cells
 
 
@@ -232,10 +234,31 @@ def axes_of(
         wanted = _graded(places, np.clip(wanted, 0.5 * plan.fine * sigma[0], _COARSEST[0] * (p1 - p0)))
         widths = plan.cell * sigma[1] * _along_q(scout, np.linspace(q0, q1, 401))
     y = _nodes(places, np.maximum(wanted, 1e-12))
-    core = _nodes(np.linspace(q0, q1, len(widths)), widths, 8)
+    core = _core(setting, (q0, q1), widths, _FINER * plan.cell * sigma[1], _BESIDE * sigma[1], scout)
     beyond = 11 * sigma[1] + max(q0 - tall[0], tall[1] - q1, 0.0)
     left, right = (_outward(depths, sigma[1], plan.cell, beyond) for depths in (core - q0, (q1 - core)[::-1]))
     return y, np.concatenate([q0 - left[::-1], core, q1 + right])
+
+
+def _core(
+    setting: Setting, faces: Ends, widths: Array, fine: float, near: float, scout: Scouted | None
+) -> Array:
+    """Nodes of q within the box: ends of obstacles where paths fail, with cells ``fine`` up to ``near`` beside them."""
+    (q0, q1), ends = faces, []
+    for p, along in filter(None, (wall.ends() for wall in setting.walls)):
+        for end in along:
+            seen = math.inf
+            if scout is not None:
+                beside = (np.abs(scout.q - end) <= 2 * scout.cells[1]) & (scout.p >= p[0]) & (scout.p <= p[1])
+                seen = float(np.where(beside, scout.visits, 0.0).max()) / float(scout.visits.max())
+            ends += [end] if q0 < end < q1 and seen > _SEEN else []
+    if not ends:
+        return _nodes(np.linspace(q0, q1, len(widths)), widths, 8)
+    places = np.linspace(q0, q1, 4001)
+    widths = np.interp(places, np.linspace(q0, q1, len(widths)), widths)
+    for end in ends:
+        widths = np.minimum(widths, fine + _GRADING * np.maximum(np.abs(places - end) - near, 0.0))
+    return graded_axis(q0, q1, places, widths, ends)
 
 
 def _outward(depths: Array, sigma: float, cell: float, beyond: float) -> Array:
