@@ -62,6 +62,7 @@ constants
 reach.nominal
 reach.sets reach.remainder
 reach.contraction reach.linear reach.sampled
+reach.below
 reach
 quadratic
 safety.answers safety.falsification

@@ -27,6 +27,7 @@ from certbound.safety.engines import (
     by_logarithms,
     constants_engine,
     in_coordinates,
+    linear_below,
     linear_chance,
     linear_engine,
     quadratic_engine,
@@ -76,6 +77,9 @@ class Engine:
         ``chance(problem)`` says, from a sketch in floating point that takes next to nothing, how far the constraints
         are away in units of what the engine needs: at less than 1 it comes after those that may do better, and has
         little time of its own once one of them has proved anything.
+    below : callable, optional
+        ``below(problem)`` to an `EngineAnswer` with a lower bound, None where it finds none: asked before all engines,
+        since it takes little, and a problem that fails often is UNSAFE then at once.
     endless : bool
         Whether it takes infinite horizons without a target.
     reaches : bool
@@ -97,6 +101,7 @@ class Engine:
     soon: int = 0
     spares: int = 0
     chance: Callable[[Problem], float] | None = None
+    below: Callable[[Problem], EngineAnswer | None] | None = None
     reaches: bool = False
     endless: bool = False
 
@@ -113,11 +118,12 @@ ENGINES: dict[str, Engine] = {
             name="linear",
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
             when="always; says most where the noise is small against the curvature of the model, and where there are "
-            "many states",
+            "many states; has lower bounds too, so that it answers UNSAFE",
             prove=by_logarithms(in_coordinates(linear_engine), again=True),
             write=of_coordinates(response_proof),
             again=True,
             chance=linear_chance,
+            below=linear_below,
         ),
         Engine(
             name="constants",
@@ -156,8 +162,7 @@ ENGINES: dict[str, Engine] = {
         Engine(
             name="values",
             words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
-            when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
-            "UNSAFE",
+            when="while nothing else has proved SAFE; bounds from both sides, and certificates of UNSAFE",
             prove=by_logarithms(in_coordinates(values_engine, beside=barrier_engine)),
             write=of_coordinates(values_proof, beside=barrier_proof),
             write_below=of_coordinates(values_proof_below, below=True),

@@ -18,13 +18,17 @@ from certbound.gaussian.response.martingales import MartingaleEvent, Martingales
 from certbound.gaussian.response.occupancy import log_occupancy
 from certbound.gaussian.response.overlaps import log_any_exceedance
 from certbound.gaussian.response.step_events import StepEvents
+from certbound.gaussian.response.unions_below import Exceedances, least_chances, least_union
 
 __all__ = [
     "balanced",
     "ClockEvents",
     "continuous_response",
     "discrete_response",
+    "Exceedances",
     "Jumps",
+    "least_chances",
+    "least_union",
     "level_along",
     "level_scale",
     "LinearResponse",
