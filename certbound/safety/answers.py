@@ -214,8 +214,10 @@ def may_decide(answer: EngineAnswer, target: float) -> bool:
 
 def with_lower(answer: EngineAnswer, before: EngineAnswer | None) -> EngineAnswer:
     """The answer with the lower bound of an earlier one of the same engine, where that is more."""
-    if before is None or before.log10_lower is None or not answer.applicable:
+    if before is None or before.log10_lower is None:
         return answer
+    if not answer.applicable:
+        return before
     if answer.log10_lower is not None and answer.log10_lower >= before.log10_lower:
         return answer
     words = f"{before.reason.rstrip('.')}; and {answer.reason}" if answer.reason else before.reason

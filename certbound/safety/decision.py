@@ -74,8 +74,8 @@ def decide(
             if method == "auto":
                 search.whole(names)
             else:
-                search.below(names)
                 search.ask(names[0], request)
+                search.below(names)
     except OutOfTime:
         _log.info("the search ended with its time")
     return search.verdict(names)
@@ -147,13 +147,12 @@ class _Search:
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
             for name in (name for name in names if ENGINES[name].sketch):
                 found = self.sketches[name] = self._asked(name, replace(self.request, quick=True))
-                if found.applicable and found.certified:
-                    self.watch.noted(found.log10_delta, found.log10_lower)
+                self.watch.noted(found.log10_delta if found.applicable and found.certified else 0.0)
         names = tuple(sorted(names, key=lambda name: not self._likely(name)))
         self.below(names)
-        few = self.refuted and self.problem.system.dimension <= _FEW
-        with self.watch.share(1.0, _ANYWAY[few] if self.refuted else math.inf):
-            self._in_turn(tuple(name for name in names if not few or ENGINES[name].write_below is not None))
+        first = sorted(names, key=lambda name: self.refuted and ENGINES[name].write_below is None)  # from both sides
+        with self.watch.share(1.0, _ANYWAY[self.problem.system.dimension <= _FEW] if self.refuted else math.inf):
+            self._in_turn(tuple(first))
         if self.safe or self.refuted or self.request.cells is not None:
             return
         if self._in_full(names, 1 - _LAST) or (self._refining(names) and self._at_length(names)):
@@ -170,9 +169,11 @@ class _Search:
         for name, below in ((name, ENGINES[name].below) for name in names if not self.safe):
             self.watch.engine = name
             with contextlib.suppress(EngineError), contained(name), self.watch.share(_BELOW, _BRIEFLY):
-                if below is not None and (found := below(self.problem)) is not None:
-                    self.answers[name] = self._without(found)
-                    self.watch.noted(0.0, self.answers[name].log10_lower)
+                asked = self.problem if self.problem.reach is None or not self.fixed else self.meeting[1]
+                if below is not None and (found := below(asked)) is not None:
+                    found = self._without(found)
+                    self.answers[name] = with_lower(self.answers.get(name, found), found)
+                    self.watch.noted(0.0, found.log10_lower)
 
     def _refining(self, names: tuple[str, ...]) -> bool:
         """Whether the smallest bound is that of an engine whose bound falls with the time that it is granted."""
@@ -335,8 +336,8 @@ class _Search:
     def _plainly(self, row: Engine, request: Request) -> EngineAnswer:
         """What an engine answers; from most of a random start where it serves sets only."""
         answer = row.prove(self.problem, request)
-        whole = answer.applicable or not self.problem.initial.random
-        return answer if whole else prove_truncated(row.prove, self.problem, request)
+        usual = answer.applicable or not self.problem.initial.random
+        return answer if usual else prove_truncated(row.prove, self.problem, request)
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
         """The answer without its lower bound where constants are unknown, or where it counts paths that only ended."""
@@ -390,8 +391,7 @@ class _Search:
 
     def verdict(self, names: tuple[str, ...]) -> Verdict:
         """The best answer, and what was left undone."""
-        for name, answer in self.sketches.items():
-            self.answers.setdefault(name, answer)
+        self.answers = self.sketches | self.answers
         answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
         found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
         seconds = MappingProxyType({name: self.spent.get(name, 0.0) for name in answers})

@@ -1,6 +1,6 @@
 """What would be certified besides what was asked; every value that is returned was itself verified SAFE.
 
-For a problem that is UNKNOWN: the longest horizon, the strongest noise, the least widening of the safe set, by
+For a problem that is UNKNOWN or UNSAFE: the longest horizon, the strongest noise, the least widening of the safe set, by
 bisection with the engine that came nearest. For one that is SAFE: the smallest probability.
 """
 

@@ -18,7 +18,7 @@ from certbound.gaussian.response.martingales import MartingaleEvent, Martingales
 from certbound.gaussian.response.occupancy import log_occupancy
 from certbound.gaussian.response.overlaps import log_any_exceedance
 from certbound.gaussian.response.step_events import StepEvents
-from certbound.gaussian.response.unions_below import Exceedances, least_chances, least_union
+from certbound.gaussian.response.unions_below import Exceedances
 
 __all__ = [
     "balanced",
@@ -27,8 +27,6 @@ __all__ = [
     "discrete_response",
     "Exceedances",
     "Jumps",
-    "least_chances",
-    "least_union",
     "level_along",
     "level_scale",
     "LinearResponse",

@@ -33,26 +33,25 @@ class Exceedances:
             nodes=self.nodes[index], rows=self.rows[index], levels=self.levels[index], lost=self.lost[index]
         )
 
+    def chances(self, response: LinearResponse) -> Array:
+        """Lower bounds of the events' probabilities, (M,), of the first cell: 0 where nothing is known."""
+        tails = np.exp(log_tail_below(_standard(response, self)[1]))
+        return np.asarray(np.maximum(tails * (1 - _ROUND) - self.lost, 0.0))
 
-def least_chances(response: LinearResponse, events: Exceedances) -> Array:
-    """Lower bounds of the events' probabilities, (M,), of the first cell: 0 where nothing is known."""
-    return np.maximum(np.exp(log_tail_below(_standard(response, events)[1])) * (1 - _ROUND) - events.lost, 0.0)
-
-
-def least_union(response: LinearResponse, events: Exceedances) -> float:
-    """A lower bound of the probability that one of the events occurs, for the first cell of a Gaussian response."""
-    least = least_chances(response, events)
-    events, least = events.chosen(np.flatnonzero(least > 0)), least[least > 0]
-    if not len(least):
-        return 0.0
-    small, _ = _standard(response, events)
-    correlation = _correlations(response, events)
-    first, second = np.triu_indices(len(least), 1)
-    both = np.diag(np.exp(log_tail(small)))
-    both[first, second] = np.exp(log_below_above(-small[first], small[second], -correlation[first, second]))
-    both[second, first] = both[first, second]
-    found = float(np.sum(least**2 / (both.sum(axis=1) * (1 + _ROUND) + 1e-300))) * (1 - _ROUND)
-    return min(max(found, float(least.max())), 1.0)
+    def union(self, response: LinearResponse) -> float:
+        """A lower bound of the probability that one of the events occurs, for the first cell of a response."""
+        least = self.chances(response)
+        events, least = self.chosen(np.flatnonzero(least > 0)), least[least > 0]
+        if not len(least):
+            return 0.0
+        small, _ = _standard(response, events)
+        correlation = _correlations(response, events)
+        first, second = np.triu_indices(len(least), 1)
+        both = np.diag(np.exp(log_tail(small)))
+        both[first, second] = np.exp(log_below_above(-small[first], small[second], -correlation[first, second]))
+        both[second, first] = both[first, second]
+        found = float(np.sum(least**2 / (both.sum(axis=1) * (1 + _ROUND) + 1e-300))) * (1 - _ROUND)
+        return min(max(found, float(least.max())), 1.0)
 
 
 def _standard(response: LinearResponse, events: Exceedances) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.gaussian.response import Exceedances, least_chances
+from certbound.gaussian.response import Exceedances
 from certbound.gaussian.scalar import log_tail
 from certbound.problem.sets import Faces, Quadratic, Region
 from certbound.reach.below.survival import centre_over
@@ -150,7 +150,7 @@ def events_of(
         labels += [breach.label] * len(nodes)
     whole = Exceedances(**{
         name: np.concatenate([getattr(one, name) for one in kept]) for name in ("nodes", "rows", "levels", "lost")})
-    chances = least_chances(response, whole)
+    chances = whole.chances(response)
     worth = np.flatnonzero(chances > _WORTH * chances.max(initial=0.0))
     if len(worth) > most:
         worth = worth[np.unique(np.linspace(0, len(worth) - 1, most).round().astype(int))]

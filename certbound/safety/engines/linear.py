@@ -15,6 +15,8 @@ from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state
 from certbound.reach.remainder import hidden_jump
 from certbound.safety.answers import AS_IT_IS, SPARED, Deviation, EngineAnswer, Request
 
+_SAYS = 1e-3  # of delta: a lower bound of less than that says nothing
+
 
 def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """Smallest probability that Thm K7' proves for the problem, with one cell unless ``asked`` for more.
@@ -84,7 +86,7 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
 def linear_below(problem: Problem) -> EngineAnswer | None:
     """A lower bound of the probability of failing, by the linear response of paths that have not failed yet."""
     found = least_failing(problem)
-    if found is None:
+    if found is None or found.probability < _SAYS * problem.delta:
         return None
     start = ", ".join(rounded(value, up=False, digits=4) for value in found.start)
     when = f"t = {found.time:.4g}" if problem.system.time == "continuous" else f"step {found.time:g}"

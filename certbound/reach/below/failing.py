@@ -25,7 +25,6 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.checks import assign
 from certbound.errors import CertboundError
-from certbound.gaussian.response import least_chances, least_union
 from certbound.gaussian.scalar import log_tail
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
@@ -132,7 +131,7 @@ def _attempts(problem: Problem) -> Iterator[_Attempt]:
     engine = _linearised(problem)
     found = breaches(engine)
     events, _ = events_of(engine, found, [(np.zeros_like(one.levels),) * 2 for one in found])
-    if not len(events.nodes) or least_union(engine.response, events) < _HOPELESS * problem.delta:
+    if not len(events.nodes) or events.union(engine.response) < _HOPELESS * problem.delta:
         return
     if not len(engine.model.active):
         yield from _tried(problem, engine)
@@ -269,6 +268,6 @@ def _least(run: Survival, found: list[Breach], bounds: tuple[Array, Array]) -> t
     events, labels = events_of(engine, found, remainder)
     if not len(events.nodes):
         return 0.0, "", 0.0
-    chances = least_chances(engine.response, events)
+    chances = events.chances(engine.response)
     likeliest = int(np.argmax(chances))
-    return least_union(engine.response, events), labels[likeliest], float(events.nodes[likeliest] * engine.step)
+    return events.union(engine.response), labels[likeliest], float(events.nodes[likeliest] * engine.step)
