@@ -12,6 +12,8 @@ import certbound as cb
 from certbound.gaussian.response import Exceedances, discrete_response
 from certbound.reach.below import least_failing
 from certbound.reach.below.pushes import plainly
+from certbound.reach.below.survival import survivors
+from certbound.reach.linear import Linearisation
 
 
 def walk(side, steps=4, during=None, start=0.0):
@@ -24,6 +26,45 @@ def test_one_time_of_a_random_walk_is_met_exactly():
     found = least_failing(walk(3.0, during=(4, 4)))
     assert found.probability == pytest.approx(norm.sf(3.0 / 2.0), rel=1e-9)
     assert found.probability <= norm.sf(1.5)
+
+
+def test_both_faces_of_an_obstacle_count():
+    system = cb.DiscreteSystem(lambda x: x, states=["x"], noise=cb.Gaussian(std=1.0))
+    safe = [cb.Outside(cb.Box([2.0], [2.5]), during=(4, 4))]
+    found = least_failing(cb.Problem(system, initial=[0.0], safe=safe, horizon=4, delta=1e-4))
+    assert found.probability == pytest.approx(norm.sf(1.0) - norm.sf(1.25), rel=1e-9)
+
+
+def test_what_the_levels_cost_is_taken_off():
+    system = cb.DiscreteSystem(lambda x: x + 1e-9 * np.sin(x), states=["x"], noise=cb.Gaussian(std=1.0))
+    safe = [cb.Inside(cb.Box([-5.0], [np.inf]), during=(4, 4))]
+    found = least_failing(cb.Problem(system, initial=[0.0], safe=safe, horizon=4, delta=1e-4))
+    assert found.levels > 0
+    least = plainly(float(norm.cdf(found.cost - 2.5)) - found.levels, found.cost)
+    assert found.probability == pytest.approx(least, rel=1e-4)
+
+
+def test_what_the_linearisation_leaves_out_is_taken_off():
+    system = cb.DiscreteSystem(lambda x: 0.5 * x - 2 * x**2, states=["x"], noise=cb.Gaussian(std=0.3))
+    safe = [cb.Inside(cb.Box([-3.0], [0.5]))]
+    found = least_failing(cb.Problem(system, initial=[0.0], safe=safe, horizon=2, delta=1e-3))
+    first = np.linspace(-3, 0.5, 20001)
+    stays = norm.pdf(first, scale=0.3) * norm.cdf((0.5 - 0.5 * first + 2 * first**2) / 0.3)
+    truth = 1 - float(np.trapezoid(stays, first))
+    late = cb.Problem(system, initial=[0.0], safe=[cb.Inside(safe[0].region, during=(2, 2))], horizon=2, delta=1e-4)
+    assert 0 < found.probability < truth
+    again = least_failing(late)
+    whole = np.linspace(-3, 3, 20001)
+    fails = norm.pdf(whole, scale=0.3) * norm.sf((0.5 - 0.5 * whole + 2 * whole**2) / 0.3)
+    assert again is None or again.probability < float(np.trapezoid(fails, whole)) + 1e-12
+
+
+def test_only_limits_that_are_asked_bound_those_who_have_not_failed():
+    found = Linearisation(walk(2.0, during=(2, 4)))
+    low, high = survivors(found)
+    assert np.all(np.isinf(low[:2]))
+    assert low[2:] == pytest.approx(-2.0)
+    assert np.all(np.isinf(high))
 
 
 def test_the_union_over_times_lies_between_the_likeliest_one_and_the_truth():
