@@ -125,7 +125,7 @@ MANY_DOORS = {
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (37, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (21, "events in both times, for noise that depends on the state and not; units; jumps"),
-    "reach.linear": (19, "certificates state the records of the search: linearisations, shares; lower bounds rest on them"),
+    "reach.linear": (19, "certificates state the records of the search: linearisations, shares; bounds from below"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (16, "one program each for rate, gain and erosion, with what it is asked; the solver"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),

@@ -10,6 +10,9 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
+from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Proof, Request
@@ -212,16 +215,33 @@ def in_order(names: tuple[str, ...], problem: Problem, answers: Mapping[str, Eng
     return tuple(sorted(names, key=lambda name: not ENGINES[name].reaches))
 
 
+def _check_defined(problem: Problem) -> None:
+    """Refuse dynamics that have no finite value at the middle of the start, without disturbance or in its middle."""
+    tape, system = problem.closed_loop, problem.system
+    middle = np.asarray(problem.initial.middle, dtype=float)
+    rows = problem.input_sequence if problem.input_sequence is not None else np.zeros((1, 0))
+    box = system.disturbance
+    pushes = np.zeros(0) if box is None else (box.low + box.high) / 2
+    with np.errstate(all="ignore"):
+        value = np.ravel(compile_numpy(tape)(0.0, *middle, *rows[0], *pushes))
+    for name, rate in zip(system.states, value.tolist()):
+        if not math.isfinite(rate):
+            place = ", ".join(f"{one} = {number:g}" for one, number in zip(system.states, middle.tolist()))
+            raise ValueError(f"`dynamics` must be defined at the start, got {rate} for {name} at {place}; start "
+                             "elsewhere, or mend the expression.")  # fmt: skip
+
+
 def check_request(problem: Problem, request: Request) -> None:
     """Refuse what is wrong with a request before any engine runs: from then on whatever fails is an engine.
 
     ValueError where the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit
-    it.
+    it, or the dynamics are not defined at the middle of the start.
     """
     from certbound.tubes.paper import check_method
 
     initial_cells(problem, request.cells)
-    _ = problem.hold is None and problem.closed_loop
+    if problem.hold is None and not problem.random:
+        _check_defined(problem)
     continuous, n = problem.system.time == "continuous", problem.system.dimension
     check_method(request.method, continuous=continuous, dimension=n)
     constants = request.constants

@@ -38,12 +38,15 @@ class Breach:
 
 
 def breaches(engine: Linearisation) -> list[Breach]:
-    """Every way to break a constraint at the end of a piece (at a step in discrete time), along the only cell."""
+    """Every way to break a constraint at the end of a piece (at a step in discrete time), along the only cell.
+
+    Leaving the model's domain is not looked for: there the model says nothing.
+    """
     first_node, found = int(engine.continuous), []
     nodes, times = engine.nodes[0, first_node:], engine.times[first_node:]
     slip = 4e-15 * float(times[-1]) * engine.continuous  # the nodes are floats near k h, the last one is the horizon
     span = Interval(times - slip, times + slip)
-    for constraint in engine.problem.kept:
+    for constraint in engine.problem.safe:
         asked = np.ones(len(times), dtype=bool)
         if constraint.during is not None:
             first, last = constraint.during
