@@ -150,9 +150,9 @@ class _Search:
                 self.watch.noted(found.log10_delta if found.applicable and found.certified else 0.0)
         names = tuple(sorted(names, key=lambda name: not self._likely(name)))
         self.below(names)
-        first = sorted(names, key=lambda name: self.refuted and ENGINES[name].write_below is None)  # from both sides
+        both = sorted(names, key=lambda name: self.refuted and ENGINES[name].write_below is None)  # from both sides
         with self.watch.share(1.0, _ANYWAY[self.problem.system.dimension <= _FEW] if self.refuted else math.inf):
-            self._in_turn(tuple(first))
+            self._in_turn(tuple(both))
         if self.safe or self.refuted or self.request.cells is not None:
             return
         if self._in_full(names, 1 - _LAST) or (self._refining(names) and self._at_length(names)):
