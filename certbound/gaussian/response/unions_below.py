@@ -69,7 +69,7 @@ def _correlations(response: LinearResponse, events: Exceedances) -> Array:
     """Upper bounds of the correlations between the events' rows at their nodes, (M, M), none below 0."""
     order = np.argsort(-events.nodes, kind="stable")
     nodes, count = events.nodes[order], len(order)
-    moved, error = events.rows[order].copy(), np.zeros_like(events.rows)
+    moved, error = events.rows[order].copy(), np.zeros(count)
     low, _ = (np.maximum(v[0], 0.0) for v in response.variance(events.rows[order][None], nodes))
     size = np.sqrt(low)
     found = np.zeros((count, count))
@@ -78,22 +78,27 @@ def _correlations(response: LinearResponse, events: Exceedances) -> Array:
         poll("covariances of single times")
         here = np.flatnonzero(nodes == node)
         begun += len(here)
-        deviation = np.sqrt(np.maximum(np.diagonal(
-            response.covariance[0, node] + response.covariance_error[0, node]), 0.0)) * (1 + _ROUND)
+        deviation = _deviations(response, node)
         for k in here.tolist():
             own = np.broadcast_to(events.rows[order[k]], (begun, moved.shape[1]))
             at = np.full(begun, node)
             high = response.covariance_of(moved[None, :begun], own[None], at)[1][0]
-            high = high + (error[:begun] @ deviation) * (np.abs(own[0]) @ deviation) * (1 + _ROUND)
+            high = high + error[:begun] * (np.abs(own[0]) @ deviation) * (1 + _ROUND)
             scale = size[:begun] * size[k]
             with np.errstate(divide="ignore", invalid="ignore"):
                 found[:begun, k] = np.where(high > 0, high / scale * (1 + _ROUND), 0.0)
         if node > nodes[-1]:
             forward, slack = response.transition[0, node - 1], float(response.transition_error[0, node - 1])
-            own_size = np.abs(moved[:begun])
-            error[:begun] = (error[:begun] @ (np.abs(forward) + slack) + own_size.sum(axis=1, keepdims=True) * slack
-                             + 2 * gamma(len(forward)) * (own_size @ np.abs(forward))) * (1 + _ROUND) + 1e-300
+            size_of = np.abs(moved[:begun])  # what the product leaves out meets the state before it, and never grows
+            rest = size_of.sum(axis=1, keepdims=True) * slack + 2 * gamma(len(forward)) * (size_of @ np.abs(forward))
+            error[:begun] += rest @ _deviations(response, node - 1) * (1 + _ROUND) + 1e-300
             moved[:begun] = moved[:begun] @ forward
     result = np.zeros((count, count))
     result[np.ix_(order, order)] = np.minimum(np.maximum(found, found.T), 1.0)
     return result
+
+
+def _deviations(response: LinearResponse, node: int) -> Array:
+    """Upper bounds of the standard deviations of all coordinates at a node, (n,)."""
+    square = np.diagonal(response.covariance[0, node] + response.covariance_error[0, node])
+    return np.asarray(np.sqrt(np.maximum(square, 0.0)) * (1 + _ROUND))

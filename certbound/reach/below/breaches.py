@@ -19,7 +19,7 @@ from certbound.reach.linear import Linearisation
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 
-_MOST = 48  # events
+_MOST = 192  # events
 _WORTH = 0.1  # of the likeliest one
 _ANGLES = (0.3, 0.6, 0.9)  # of the corners of a box in a ball, seen from its centre
 
