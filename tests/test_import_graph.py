@@ -62,6 +62,7 @@ constants
 reach.nominal
 reach.sets reach.remainder
 reach.contraction reach.linear reach.sampled
+reach.below
 reach
 quadratic
 safety.answers safety.falsification
@@ -123,8 +124,8 @@ MANY_DOORS = {
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (37, "the one description of functions, which every room reads, differentiates and evaluates"),
-    "gaussian.response": (20, "events in both times, for noise that depends on the state and not; units; jumps"),
-    "reach.linear": (17, "certificates state the records of the search: linearisations, shares, levels, references"),
+    "gaussian.response": (21, "events in both times, for noise that depends on the state and not; units; jumps"),
+    "reach.linear": (19, "certificates state the records of the search: linearisations, shares; bounds from below"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (16, "one program each for rate, gain and erosion, with what it is asked; the solver"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
@@ -137,7 +138,7 @@ MANY_DOORS = {
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (9, "to and from each library"),
     "safety.certificates": (7, "a writer an engine, one for each side where it has two, and one of other coordinates"),
-    "safety.engines": (17, "the engines, and the rooms that their certificates restate"),
+    "safety.engines": (18, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -210,6 +210,18 @@ def may_decide(answer: EngineAnswer, target: float) -> bool:
     if not answer.applicable or answer.conclusive or answer.log10_lower is None:
         return False
     return answer.log10_lower <= math.log10(target) < answer.log10_delta <= answer.log10_lower + _NEAR
+
+
+def with_lower(answer: EngineAnswer, before: EngineAnswer | None) -> EngineAnswer:
+    """The answer with the lower bound of an earlier one of the same engine, where that is more."""
+    if before is None or before.log10_lower is None:
+        return answer
+    if not answer.applicable:
+        return before
+    if answer.log10_lower is not None and answer.log10_lower >= before.log10_lower:
+        return answer
+    words = f"{before.reason.rstrip('.')}; and {answer.reason}" if answer.reason else before.reason
+    return replace(answer, log10_lower=before.log10_lower, reason=words)
 
 
 def settled(log10_delta: float, target: float) -> float:

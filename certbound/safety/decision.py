@@ -19,20 +19,20 @@ from typing import Any
 from certbound.errors import EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
-from certbound.safety.answers import EngineAnswer, Request, is_more_than, may_decide
+from certbound.safety.answers import EngineAnswer, Request, is_more_than, may_decide, with_lower
 from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import arrival, best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of, in_order
-from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, unsafe, verdict_of
+from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, undone, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
 
 _log = logging.getLogger(__name__)
 
-_LARGE = 60  # states beyond which no other engine is asked once one has proved SAFE
+_LARGE, _LASTING = 60, 100_000  # states beyond which nobody else is asked once one has proved SAFE; steps
 _PATIENCE = 0.4  # of the time that is left, after which the other engines have a turn
 _TURN = 0.5  # of the time that is left then, for all of them
 _LAST = 0.2  # of the time that is left then, where none of them has much of a chance
@@ -40,8 +40,9 @@ _FIRST = 0.1  # of the time that is left, for first bounds where the engine in t
 _SOON = 0.5  # seconds after which those that have a first bound soon are asked for it, under a limit
 _UNLIKELY = 2.0  # seconds for an engine that has hardly a chance, once there is a bound
 _THOROUGH, _LONGER = 120.0, 1.0  # seconds for an engine asked once more without a limit, or times those so far
-_LASTING = 100_000  # steps
 _HOPED = 10.0  # seconds for a proof that noise leads where noise-free trajectories do not
+_BELOW, _BRIEFLY = 0.3, 5.0  # of the time that is left, and seconds, for lower bounds that take little
+_ANYWAY, _FEW = (1.0, 2.0), 3  # seconds for others once UNSAFE is proved, more up to so many states: from both sides
 _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change the verdict
 
 
@@ -53,9 +54,8 @@ def decide(
 
     Without a watch the one that runs already, if any, ends the search.
     """
-    request = Request(
-        method="auto" if method in ENGINES else method, cells=cells, constants=constants, thorough=method != "auto"
-    )
+    plain = "auto" if method in ENGINES else method
+    request = Request(method=plain, cells=cells, constants=constants, thorough=method != "auto")
     names = engines_of(method)
     watch = watch or current_watch() or Watch()
     for start in problem.starts:
@@ -75,6 +75,7 @@ def decide(
                 search.whole(names)
             else:
                 search.ask(names[0], request)
+                search.below(names)
     except OutOfTime:
         _log.info("the search ended with its time")
     return search.verdict(names)
@@ -96,8 +97,7 @@ class _Search:
     @property
     def settled(self) -> bool:
         """Whether no other engine can change the verdict, or do much better."""
-        found = [*self.answers.values(), *self.sketches.values()]
-        return any(is_safe(answer, self.problem) or answer.conclusive for answer in found)
+        return self.safe or any(one.conclusive for one in (*self.answers.values(), *self.sketches.values()))
 
     @property
     def safe(self) -> bool:
@@ -147,10 +147,12 @@ class _Search:
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
             for name in (name for name in names if ENGINES[name].sketch):
                 found = self.sketches[name] = self._asked(name, replace(self.request, quick=True))
-                if found.applicable and found.certified:
-                    self.watch.noted(found.log10_delta, found.log10_lower)
+                self.watch.noted(found.log10_delta if found.applicable and found.certified else 0.0)
         names = tuple(sorted(names, key=lambda name: not self._likely(name)))
-        self._in_turn(names)
+        self.below(names)
+        both = sorted(names, key=lambda name: self.refuted and ENGINES[name].write_below is None)  # from both sides
+        with self.watch.share(1.0, _ANYWAY[self.problem.system.dimension <= _FEW] if self.refuted else math.inf):
+            self._in_turn(tuple(both))
         if self.safe or self.refuted or self.request.cells is not None:
             return
         if self._in_full(names, 1 - _LAST) or (self._refining(names) and self._at_length(names)):
@@ -162,6 +164,17 @@ class _Search:
         if not self.safe:
             self._at_length(names)
 
+    def below(self, names: tuple[str, ...]) -> None:
+        """Ask for lower bounds that take little."""
+        for name, below in ((name, ENGINES[name].below) for name in names if not self.safe):
+            self.watch.engine = name
+            with contextlib.suppress(EngineError), contained(name), self.watch.share(_BELOW, _BRIEFLY):
+                asked = self.problem if self.problem.reach is None or not self.fixed else self.meeting[1]
+                if below is not None and (found := below(asked)) is not None:
+                    found = self._without(found)
+                    self.answers[name] = with_lower(self.answers.get(name, found), found)
+                    self.watch.noted(0.0, found.log10_lower)
+
     def _refining(self, names: tuple[str, ...]) -> bool:
         """Whether the smallest bound is that of an engine whose bound falls with the time that it is granted."""
         found = [name for name in names if name in self.answers]
@@ -170,11 +183,11 @@ class _Search:
 
     def _at_length(self, names: tuple[str, ...]) -> bool:
         """Where somebody waits for a limit of his own: engines that refine go on, the nearest first; whether SAFE."""
-        if not self.watch.patient or self.watch.limit is None:
-            return False
-        for name in sorted(names, key=lambda name: 0.0 if name not in self.answers else self.answers[name].log10_delta):
-            first = self.answers.get(name)
-            if first is None or not (ENGINES[name].refines and first.applicable) or first.conclusive or self.safe:
+        at_length = self.watch.patient and self.watch.limit is not None
+        found = [name for name in names if name in self.answers and at_length]
+        for name in sorted(found, key=lambda name: self.answers[name].log10_delta):
+            first = self.answers[name]
+            if not (ENGINES[name].refines and first.applicable) or first.conclusive or self.safe:
                 continue
             if first.log10_lower is None or not is_more_than(first.log10_lower, self.problem.delta):
                 with self.watch.share(1 - _LAST):
@@ -282,7 +295,7 @@ class _Search:
         def found(answer: EngineAnswer) -> None:
             before = self.answers.get(name)
             if before is None or not before.applicable or answer.log10_delta <= before.log10_delta:
-                self.answers[name] = answer
+                self.answers[name] = with_lower(answer, before)
             if answer.applicable and answer.certified:
                 self.watch.noted(answer.log10_delta, answer.log10_lower)
 
@@ -290,8 +303,7 @@ class _Search:
             answer = self._asked(name, replace(request, found=found))
         except OutOfTime:
             self.left_at[name] = self.watch.phase
-            if name not in self.answers:
-                self.answers[name] = stopped(name, self.watch.phase)
+            self.answers.setdefault(name, stopped(name, self.watch.phase))
             raise
         self.left_at.pop(name, None)
         if answer.applicable or name not in self.answers:
@@ -324,9 +336,8 @@ class _Search:
     def _plainly(self, row: Engine, request: Request) -> EngineAnswer:
         """What an engine answers; from most of a random start where it serves sets only."""
         answer = row.prove(self.problem, request)
-        if answer.applicable or not self.problem.initial.random:
-            return answer
-        return prove_truncated(row.prove, self.problem, request)
+        usual = answer.applicable or not self.problem.initial.random
+        return answer if usual else prove_truncated(row.prove, self.problem, request)
 
     def _without(self, answer: EngineAnswer) -> EngineAnswer:
         """The answer without its lower bound where constants are unknown, or where it counts paths that only ended."""
@@ -380,18 +391,10 @@ class _Search:
 
     def verdict(self, names: tuple[str, ...]) -> Verdict:
         """The best answer, and what was left undone."""
-        for name, answer in self.sketches.items():
-            self.answers.setdefault(name, answer)
+        self.answers = self.sketches | self.answers
         answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
         found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
-        found = replace(found, seconds=MappingProxyType({name: self.spent.get(name, 0.0) for name in answers}))
+        seconds = MappingProxyType({name: self.spent.get(name, 0.0) for name in answers})
         over = self.watch.limit is not None and self.watch.left <= 0 and found.status == "UNKNOWN"
-        return replace(found, reason=f"{found.reason} {self._undone(names)}".strip()) if over else found
-
-    def _undone(self, names: tuple[str, ...]) -> str:
-        """What more time would be spent on."""
-        begun = [(name, self.left_at[name]) for name in names if name in self.left_at]
-        rest = [f"{name} ({phase})" if phase else name for name, phase in begun]
-        rest += [name for name in names if name not in self.answers]
-        more = f" More time would go on with {', then '.join(rest)}." if rest else ""
-        return f"The search was stopped after {self.watch.limit:g} s.{more}"
+        left = f" {undone(self.watch, self.answers, self.left_at, names)}" if over else ""
+        return replace(found, seconds=seconds, reason=f"{found.reason}{left}".strip())

@@ -1,7 +1,7 @@
 """What would be certified besides what was asked; every value that is returned was itself verified SAFE.
 
-For a problem that is UNKNOWN: the longest horizon, the strongest noise, the least widening of the safe set, by
-bisection with the engine that came nearest. For one that is SAFE: the smallest probability.
+For a problem that is UNKNOWN or UNSAFE: the longest horizon, the strongest noise, the least widening of the safe set,
+by bisection with the engine that came nearest. For one that is SAFE: the smallest probability.
 """
 
 from __future__ import annotations

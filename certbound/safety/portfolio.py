@@ -10,7 +10,10 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from certbound.checks import instance
+from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Proof, Request
@@ -28,6 +31,7 @@ from certbound.safety.engines import (
     by_logarithms,
     constants_engine,
     in_coordinates,
+    linear_below,
     linear_chance,
     linear_engine,
     quadratic_engine,
@@ -78,6 +82,9 @@ class Engine:
         ``chance(problem)`` says, from a sketch in floating point that takes next to nothing, how far the constraints
         are away in units of what the engine needs: at less than 1 it comes after those that may do better, and has
         little time of its own once one of them has proved anything.
+    below : callable, optional
+        ``below(problem)`` to an `EngineAnswer` with a lower bound, None where it finds none: asked before all engines,
+        since it takes little, and a problem that fails often is UNSAFE then at once.
     endless : bool
         Whether it takes infinite horizons without a target.
     reaches : bool
@@ -99,6 +106,7 @@ class Engine:
     soon: int = 0
     spares: int = 0
     chance: Callable[[Problem], float] | None = None
+    below: Callable[[Problem], EngineAnswer | None] | None = None
     reaches: bool = False
     endless: bool = False
 
@@ -115,11 +123,12 @@ ENGINES: dict[str, Engine] = {
             name="linear",
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
             when="always; says most where the noise is small against the curvature of the model, and where there are "
-            "many states",
+            "many states; has lower bounds too, so that it answers UNSAFE",
             prove=by_logarithms(in_coordinates(linear_engine), again=True),
             write=of_coordinates(response_proof),
             again=True,
             chance=linear_chance,
+            below=linear_below,
         ),
         Engine(
             name="constants",
@@ -158,8 +167,7 @@ ENGINES: dict[str, Engine] = {
         Engine(
             name="values",
             words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
-            when="while nothing else has proved SAFE; the only one with a lower bound, so the only one that answers "
-            "UNSAFE",
+            when="while nothing else has proved SAFE; bounds from both sides, and certificates of UNSAFE",
             prove=by_logarithms(in_coordinates(values_engine, beside=barrier_engine)),
             write=of_coordinates(values_proof, beside=barrier_proof),
             write_below=of_coordinates(values_proof_below, below=True),
@@ -209,16 +217,33 @@ def in_order(names: tuple[str, ...], problem: Problem, answers: Mapping[str, Eng
     return tuple(sorted(names, key=lambda name: not ENGINES[name].reaches))
 
 
+def _check_defined(problem: Problem) -> None:
+    """Refuse dynamics that have no finite value at the middle of the start, without disturbance or in its middle."""
+    tape, system = problem.closed_loop, problem.system
+    middle = np.asarray(problem.initial.middle, dtype=float)
+    rows = problem.input_sequence if problem.input_sequence is not None else np.zeros((1, 0))
+    box = system.disturbance
+    pushes = np.zeros(0) if box is None else (box.low + box.high) / 2
+    with np.errstate(all="ignore"):
+        value = np.ravel(compile_numpy(tape)(0.0, *middle, *rows[0], *pushes))
+    for name, rate in zip(system.states, value.tolist()):
+        if not math.isfinite(rate):
+            place = ", ".join(f"{one} = {number:g}" for one, number in zip(system.states, middle.tolist()))
+            raise ValueError(f"`dynamics` must be defined at the start, got {rate} for {name} at {place}; start "
+                             "elsewhere, or mend the expression.")  # fmt: skip
+
+
 def check_request(problem: Problem, request: Request) -> None:
     """Refuse what is wrong with a request before any engine runs: from then on whatever fails is an engine.
 
     ValueError where the system has inputs and no plan, ``cells`` cannot be, or the method or the constants do not fit
-    it.
+    it, or the dynamics are not defined at the middle of the start.
     """
     from certbound.tubes.paper import check_method
 
     initial_cells(problem, request.cells)
-    _ = problem.hold is None and problem.closed_loop
+    if problem.hold is None and not problem.random:
+        _check_defined(problem)
     continuous, n = problem.system.time == "continuous", problem.system.dimension
     check_method(request.method, continuous=continuous, dimension=n)
     constants = request.constants

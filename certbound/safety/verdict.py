@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -15,6 +15,7 @@ from certbound.problem.problem import Problem
 from certbound.reach.sets import ReachTube
 from certbound.safety.answers import SPARED, Deviation, EngineAnswer, is_at_most, is_more_than, settled
 from certbound.safety.falsification import Violation
+from certbound.watch import Watch
 
 if TYPE_CHECKING:
     from certbound.safety.starts import SafeStarts
@@ -279,6 +280,15 @@ def best_lower(answers: Mapping[str, EngineAnswer]) -> float | None:
     """The largest proved lower bound of log10 of the probability, None where no engine has one."""
     found = [answer.log10_lower for answer in answers.values() if answer.applicable and answer.log10_lower is not None]
     return max(found, default=None)
+
+
+def undone(watch: Watch, answered: Collection[str], left_at: Mapping[str, str], names: tuple[str, ...]) -> str:
+    """What more time would be spent on: engines that were interrupted at some phase, and those not asked."""
+    begun = [(name, left_at[name]) for name in names if name in left_at]
+    rest = [f"{name} ({phase})" if phase else name for name, phase in begun]
+    rest += [name for name in names if name not in answered]
+    more = f" More time would go on with {', then '.join(rest)}." if rest else ""
+    return f"The search was stopped after {watch.limit:g} s.{more}"
 
 
 def _bounded(answer: EngineAnswer) -> str:

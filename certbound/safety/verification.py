@@ -89,7 +89,7 @@ def verify_safety(
         if smallest and verdict.status == "SAFE":
             for found in smaller_verdicts(verdict, method=method, cells=cells):
                 verdict = found
-        if explain and verdict.status == "UNKNOWN":
+        if explain and verdict.status in ("UNKNOWN", "UNSAFE"):
             for limits in limits_so_far(verdict, cells=cells):
                 verdict = replace(verdict, limits=limits)
     return verdict

@@ -322,6 +322,13 @@ def test_inputs_without_a_plan_are_refused():
         verify_safety(problem)
 
 
+def test_dynamics_that_are_undefined_at_the_start_are_refused():
+    system = cb.ContinuousSystem(lambda x: [-np.sqrt(x[0] - 5)], states=["h"], diffusion=0.1)
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1)
+    with pytest.raises(ValueError, match="`dynamics` must be defined at the start, got nan for h at h = 0"):
+        cb.verify_safety(problem)
+
+
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="`method` must be one of auto, linear, constants, barrier"):
         verify_safety(brownian(), method="magic")

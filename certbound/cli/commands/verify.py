@@ -62,7 +62,7 @@ JobsOption = Annotated[int, option("--jobs", "N", "Processes that prove cells si
 CertificateOption = Annotated[Path | None, option("--certificate", "FILE", "Write the certificate.")]
 ReportOption = Annotated[Path | None, option("--report", "FILE", "Write one HTML page.")]
 ExplainOption = Annotated[
-    bool, typer.Option("--explain", help="Show what each engine found, and for UNKNOWN what would be SAFE.")
+    bool, typer.Option("--explain", help="Show what each engine found, and for UNKNOWN and UNSAFE what would be SAFE.")
 ]
 SmallestOption = Annotated[
     bool, typer.Option("--smallest", help="Once SAFE, go on to the smallest probability that can be proved.")
@@ -112,7 +112,7 @@ def verify(
         result["taken"] = list(notes(problem))
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
         _print(subject, result, verdict.caution)
-    if explain and verdict.status == "UNKNOWN":
+    if explain and verdict.status in ("UNKNOWN", "UNSAFE"):
         result["limits"] = _limits(verdict, cells, clock)
         if not as_json and not SETTINGS.quiet:
             console().print(result["limits"]["summary"], markup=False)

@@ -18,12 +18,14 @@ from certbound.gaussian.response.martingales import MartingaleEvent, Martingales
 from certbound.gaussian.response.occupancy import log_occupancy
 from certbound.gaussian.response.overlaps import log_any_exceedance
 from certbound.gaussian.response.step_events import StepEvents
+from certbound.gaussian.response.unions_below import Exceedances
 
 __all__ = [
     "balanced",
     "ClockEvents",
     "continuous_response",
     "discrete_response",
+    "Exceedances",
     "Jumps",
     "level_along",
     "level_scale",

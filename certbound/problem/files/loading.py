@@ -80,6 +80,8 @@ def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Proble
         raise ValueError(f"the problem file is not TOML: {error}{twice}.") from error
     except RecursionError as error:
         raise ValueError("the problem file is nested too deeply.") from error
+    if not content:
+        raise ValueError("the problem file is empty; `certbound new NAME` writes one that works.")
     return _built(content, folder, parameters)
 
 

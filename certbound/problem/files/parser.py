@@ -28,6 +28,7 @@ _CURES = {
     "[": "indexing does not exist here; use the states' names",
     "{": "braces do not exist here",
     "^": "write ** for powers",
+    "%": "percent signs do not exist here; write 0.01 for 1 %",
     "=": "an expression has no assignment; use [definitions]",
     "'": "text does not exist here",
     '"': "text does not exist here",
@@ -101,6 +102,8 @@ class _Parser:
         before = self.tokens[self.next - 1]
         if token.text == ",":
             return "; write decimals with a point" if before.kind == "number" else ""
+        if before.kind == "number" and token.kind == "name" and self.next == 1 and token.text not in self.names:
+            return f"; write {before.text} without a unit, which [units] can name"
         return f"; write {before.text}*{token.text}" if before.kind == "number" else "; write * to multiply"
 
     def _split(self) -> list[_Token]:

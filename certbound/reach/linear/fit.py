@@ -7,6 +7,8 @@ later. Everything here proposes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from certbound.arrays import Array
@@ -22,14 +24,16 @@ _EARLY = 5
 _STEEPEST = 2.0  # ||Jhat|| h, at most so many times that of the Jacobian, or 1/2
 
 
-def fitted(engine: Linearisation, nonlinear: Share) -> Linearisation:
+def fitted(
+    engine: Linearisation, nonlinear: Share, *, make: Callable[[Linearisation], Inclusion] = Inclusion
+) -> Linearisation:
     """``engine`` with slopes fitted over the deviations that a probability of ``nonlinear`` leaves out.
 
-    The fit is repeated where the remainder of the first one was large.
+    The fit is repeated where the remainder of the first one was large; ``make`` says which deviations there are.
     """
     if not len(engine.model.active):
         return engine
-    run = Inclusion(engine)
+    run = make(engine)
     for _ in range(2):
         tube = _tube(run, nonlinear)
         if tube is None:
@@ -44,7 +48,7 @@ def fitted(engine: Linearisation, nonlinear: Share) -> Linearisation:
         engine = other
         if grown < _LARGEST / 4:
             break
-        run = Inclusion(engine)
+        run = make(engine)
     return engine
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
-from certbound.safety.engines.linear import linear_engine
+from certbound.safety.engines.linear import linear_below, linear_engine
 from certbound.safety.engines.linear_sketch import linear_chance
 from certbound.safety.engines.oblique_limits import Apart, Logarithmic, Turned, by_logarithms, in_coordinates
 from certbound.safety.engines.quadratic import quadratic_engine
@@ -23,6 +23,7 @@ __all__ = [
     "Erosion",
     "in_coordinates",
     "joined",
+    "linear_below",
     "linear_chance",
     "linear_engine",
     "log10_sum",

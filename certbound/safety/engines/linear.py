@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from certbound.display import rounded
 from certbound.problem.held import held_loop
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
+from certbound.reach.below import least_failing
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
 from certbound.reach.remainder import hidden_jump
 from certbound.safety.answers import AS_IT_IS, SPARED, Deviation, EngineAnswer, Request
+
+_SAYS = 1e-3  # of delta: a lower bound of less than that says nothing
 
 
 def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
@@ -75,6 +81,21 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
         time=answer.time, constraint=answer.constraint, reason=answer.reason, tube=tube, reach=answer.noise_free_reach,
         deviation=None if tube is None else _deviation(answer, tube), method="linear", details=answer, foresight=True,
     )
+
+
+def linear_below(problem: Problem) -> EngineAnswer | None:
+    """A lower bound of the probability of failing, by the linear response of paths that have not failed yet."""
+    found = least_failing(problem)
+    if found is None or found.probability < _SAYS * problem.delta:
+        return None
+    start = ", ".join(rounded(value, up=False, digits=4) for value in found.start)
+    when = f"t = {found.time:.4g}" if problem.system.time == "continuous" else f"step {found.time:g}"
+    least = math.log10(found.probability)
+    words = (
+        f"from ({start}) the noise breaks '{found.label}' by about {when} with a probability of at least "
+        f"{rounded(found.probability, up=False, digits=3)}"
+    )
+    return EngineAnswer(log10_lower=least - 1e-14 * (1 + abs(least)), method="linear", reason=f"{words}.")
 
 
 def _deviation(answer: LinearAnswer, tube: DeviationTube) -> Deviation:

@@ -276,3 +276,8 @@ def test_states_may_have_greek_names(tmp_path):
     assert problem.system.states == ("\u03b8", "\u03c9")
     save(problem.replace(name="again"), tmp_path / "greek.toml")
     assert same(problem.replace(name="again"), load(tmp_path / "greek.toml"))
+
+
+def test_an_empty_file_is_called_so():
+    with pytest.raises(ValueError, match="the problem file is empty; `certbound new NAME`"):
+        loads("\n# nothing yet\n")

@@ -85,6 +85,8 @@ def test_precedence_and_functions(text, value):
         ("x = 2", "an expression has no assignment"),
         ("'x'", "text does not exist here"),
         ("x; y", "such a character does not exist here"),
+        ("1%", "percent signs do not exist here .*write 0.01 for 1 %"),
+        ("1 second", "unexpected 'second'; write 1 without a unit"),
         ("x ** lambda", "unknown name 'lambda'"),
         ("__import__('os')", "text does not exist here"),
         ("__import__(x)", "unknown function '__import__'"),

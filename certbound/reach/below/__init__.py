@@ -1,0 +1,7 @@
+"""Lower bounds of the probability of failing, for any number of states."""
+
+from __future__ import annotations
+
+from certbound.reach.below.failing import least_failing
+
+__all__ = ["least_failing"]
