@@ -23,7 +23,7 @@ from certbound.problem.random_constants import Random
 from certbound.problem.sets import Inside, StartUnion
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import precision, upper
-from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most
+from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most, is_more_than
 from certbound.safety.portfolio import ENGINES
 
 FORMAT = "certbound certificate"
@@ -172,8 +172,7 @@ def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, 
             "certificates state no lower bounds where the start is a union: verify by itself the member that is UNSAFE."
         )
     refusals: list[str] = []
-    found = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_lower is not None]
-    for name, answer in sorted(found, key=lambda item: -(item[1].log10_lower or 0.0)):
+    for name, answer in _answers_below(problem, verdict):
         try:
             write = ENGINES[name].write_below
             if write is None:
@@ -214,6 +213,23 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
             answer = known[name] = known[name] if name in known else _asked_now(problem, name)
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
+
+
+def _answers_below(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
+    """Engines whose lower bounds are more than delta, the best first; then those that had too little time for that."""
+
+    def refuting(name: str, answer: EngineAnswer | None) -> list[tuple[float, str, EngineAnswer]]:
+        if answer is None or not answer.applicable or answer.log10_lower is None:
+            return []
+        return [(-answer.log10_lower, name, answer)] if is_more_than(answer.log10_lower, problem.delta) else []
+
+    found = [row for item in verdict.answers.items() for row in refuting(*item)]
+    yield from ((name, answer) for _, name, answer in sorted(found, key=lambda row: row[0]))
+    known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
+    for name, row in ENGINES.items():
+        if row.write_below is not None and name not in {name for _, name, _ in found}:
+            answer = known[name] = known[name] if name in known else _asked_now(problem, name)
+            yield from (row[1:] for row in refuting(name, answer))
 
 
 def _asked_now(problem: Problem, name: str) -> EngineAnswer:

@@ -61,9 +61,11 @@ class Survival(LinearRun):
         return np.full(self.rows.shape[:3], _BEYOND * widest)
 
     def polytope(self, levels: Array, remainder: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-        """See `Inclusion.polytope`; cut by the safe set."""
+        """See `Inclusion.polytope`; cut by the safe set, which is all there is without levels."""
         low, high = super().polytope(levels, remainder)
         count = len(self.engine.model.active)
+        if self.enclosed and np.all(levels >= self.unbounded_levels):
+            low[:], high[:] = -np.inf, np.inf
         cut = np.maximum(low[:, :count], self.clip[0]), np.minimum(high[:, :count], self.clip[1])
         met = np.all(cut[0] <= cut[1], axis=1)[:, None]  # elsewhere no path survives: any bounds will do
         low[:, :count], high[:, :count] = (np.where(met, own, old[:, :count]) for own, old in zip(cut, (low, high)))
