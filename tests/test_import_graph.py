@@ -399,6 +399,14 @@ def test_no_private_name_is_imported() -> None:
     assert found == []
 
 
+def test_no_door_has_the_name_of_a_module_beside_it() -> None:
+    """A module that is loaded later takes the place of what the door offers under its name."""
+    rooms = [PACKAGE / room.replace(".", "/") for room in subrooms_of(PACKAGE)]
+    taken = [(room, name) for room in rooms for name in names_offered(room / "__init__.py")
+             if (room / f"{name}.py").exists() or (room / name).exists()]  # fmt: skip
+    assert taken == []
+
+
 def test_a_module_name_means_one_thing() -> None:
     names = Counter(path.stem for path in PACKAGE.rglob("*.py") if path.stem != "__init__")
     assert {name for name, count in names.items() if count > 1} <= set(TWICE)

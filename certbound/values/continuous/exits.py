@@ -121,11 +121,11 @@ def bound_exits(
     proposed: Sequence[Proposed] = ()
     below: Sequence[Proposed] = ()
     if target is not None and problem.system.dimension == 2:
-        from certbound.values.continuous.curved import target_ramps
+        from certbound.values.continuous.curved import ramps_for
         from certbound.values.continuous.plane import bound_failing
 
         _refuse_random(problem)
-        found = bound_failing(problem, model, target, begin + seconds, target_ramps)
+        found = bound_failing(problem, model, target, begin + seconds, ramps_for)
         upper, least, words, (proposed, below) = found
     elif target is not None:
         from certbound.values.continuous.line import bound_arrival

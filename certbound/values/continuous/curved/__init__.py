@@ -5,7 +5,7 @@ From the bottom: ``boundaries`` (what is safe, in outward-rounded arithmetic), `
 ``near_walls`` (of U), ``bounding``; ``target_ramps`` proposes for targets.
 """
 
-from certbound.values.continuous.curved.bounding import bound_region, target_ramps
+from certbound.values.continuous.curved.bounding import bound_region, ramps_for
 from certbound.values.continuous.curved.region import boxed, walled
 
-__all__ = ["bound_region", "boxed", "target_ramps", "walled"]
+__all__ = ["bound_region", "boxed", "ramps_for", "walled"]

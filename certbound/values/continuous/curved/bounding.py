@@ -99,7 +99,7 @@ def bound_region(problem: Problem, model: Model, deadline: float, wanted: float,
     return upper, None, words, ([], [])
 
 
-def target_ramps(plane: Plane, target: Set, cells: int, upper: bool) -> TargetRamps:
+def ramps_for(plane: Plane, target: Set, cells: int, upper: bool) -> TargetRamps:
     """What proposes the probability of arriving in a target of axial faces."""
     from certbound.values.continuous.curved.target_ramps import ramps_to
 
