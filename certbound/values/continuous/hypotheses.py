@@ -385,13 +385,18 @@ def extreme_over(
     exact = [np.flatnonzero((axis >= low) & (axis <= high)) for axis, (low, high) in zip(surface.axes, starts)]
     index = np.ix_(*itertools.chain.from_iterable((nodes, [0]) for nodes in exact))
     at_nodes = float(surface.values[0][index].max()) if all(len(nodes) for nodes in exact) else -math.inf
-    low, high = surface.range_at(0)
-    touched = np.ix_(*(_touched(axis, *ends) for axis, ends in zip(surface.axes, starts)))
+    touched = [_touched(axis, *ends) for axis, ends in zip(surface.axes, starts)]
     if upper:
         if all(low == high for low, high in starts) and at_nodes > -math.inf:
             return at_nodes
-        return float(high[touched].max())
-    return max(at_nodes, float(low[touched].max()))
+        for axis, (nodes, (low, high)) in enumerate(zip(exact, starts)):
+            if low == high and len(nodes):  # on a line of the grid
+                found = surface.across(axis, int(nodes[0]), begin=True)[1][0]
+                return float(found[np.ix_(*touched[:axis], *touched[axis + 1 :])].max())
+    low, high = surface.range_at(0)
+    if upper:
+        return float(high[np.ix_(*touched)].max())
+    return max(at_nodes, float(low[np.ix_(*touched)].max()))
 
 
 def _touched(axis: Array, low: float, high: float) -> Index:
