@@ -1,10 +1,11 @@
-"""Random problems with a target, of one and two states in discrete and in continuous time: both bounds beside the truth.
+"""Random problems with a target, one and two states, discrete and continuous time: both bounds beside the truth.
 
     python -m tests.safety.reach_avoid [first] [last] [seconds]
 
 Of every seed one problem is drawn whose probability of failing lies between .005 and .9 (simulated from the corners and
 the middle of its starts, the worst of them), kind by kind in turn. The verdict is asked at delta = that probability,
-which neither bound can settle; where the noise-free path fails, value functions are asked by themselves. Seconds are those of the processor.
+which neither bound can settle; where the noise-free path fails, value functions are asked by themselves. Seconds are
+those of the processor.
 """
 
 from __future__ import annotations

@@ -218,7 +218,7 @@ class Surface:
         return self.across(axis, -side)
 
     def across(self, axis: int, node: int, *, begin: bool = False) -> tuple[Array, Array]:
-        """The same where a state is at one of its nodes; ``begin``: in the first slab, V being what it is at its start."""
+        """The same where a state is at one of its nodes; ``begin``: V is in the first slab what it is at its start."""
         index: tuple[Any, ...] = (slice(None), *((slice(None),) * (2 * axis)), node, 0)
         parts = [self.values[:-1], self.start_rates, self.values[1:], self.end_rates]
         data = np.stack([part[index] for part in parts], axis=1)

@@ -34,8 +34,9 @@ from certbound.values.continuous.surface import Surface
 _CROWD = 1.0
 _ROUND = {False: 1.4, True: 0.9}  # corners, in cells: inside the target, and around it
 _BULGE = 2.5  # of the latter: how far along the edges corners of the target bulge
-_CELLS, _SHARE = 3, 0.25  # how far corners of the box reach, and how far Q is off 0 there, in units of Q where they end
+_CELLS, _SHARE = 3, 0.4  # how far corners of the box reach, and how far Q is off 0 there, in units of Q where they end
 _CLOSELY = 0.02  # correlated
+_SHIFT = 5.0  # ramps before the horizon, from above: sources feed each other in younger layers
 _UNIT = 0.7  # a cell beside the target, in units of the evenly spread ones
 _HAIR = 1e-9  # of the box
 _NEAR = 3.0  # cells over which Q goes from 0 to 1 where the target's edge meets a face
@@ -43,6 +44,8 @@ _NEAR = 3.0  # cells over which Q goes from 0 to 1 where the target's edge meets
 
 class TargetRamps(WalledRamps):
     """Q near 1 on the walls. ``ends`` are places along each axis through which lines of the grid go."""
+
+    shift = _SHIFT
 
     def __init__(self, plane: Plane, walls: Deep, cells: int, ends: list[list[float]], *, arrives: bool) -> None:
         self.ends, self.arrives = ends, arrives
