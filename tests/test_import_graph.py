@@ -400,6 +400,14 @@ def test_no_private_name_is_imported() -> None:
     assert found == []
 
 
+def test_no_door_has_the_name_of_a_module_beside_it() -> None:
+    """A module that is loaded later takes the place of what the door offers under its name."""
+    listed = [path for path in PACKAGE.rglob("__init__.py") if "names_in" not in path.read_text("utf-8")]
+    taken = [(path, name) for path in listed for name in names_offered(path)
+             if (path.parent / f"{name}.py").exists() or (path.parent / name).exists()]  # fmt: skip
+    assert taken == []
+
+
 def test_a_module_name_means_one_thing() -> None:
     names = Counter(path.stem for path in PACKAGE.rglob("*.py") if path.stem != "__init__")
     assert {name for name, count in names.items() if count > 1} <= set(TWICE)

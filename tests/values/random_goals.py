@@ -20,27 +20,35 @@ Random = np.random.Generator
 KINDS = ("targets", "windows")
 
 
-def _system(rng: Random) -> cb.ContinuousSystem:
-    gain: Any = np.diag(rng.uniform(0.3, 0.7, 2))
-    gain[0, 1] = rng.choice([0.0, 0.2, -0.2])
-    f = drift(rng, 2, terms=(0, 1, 2, 5, 6), clock=bool(rng.random() < 0.2), pushed=False, pull=rng.uniform(0.0, 1.0))
-    return cb.ContinuousSystem(f, states=2, diffusion=gain)
+def _system(rng: Random, n: int = 2, step: float = 0.0) -> cb.ContinuousSystem | cb.DiscreteSystem:
+    """With a ``step`` in discrete time: what Euler's method makes of it."""
+    gain: Any = np.diag(rng.uniform(0.3, 0.7, n))
+    gain[0, n - 1] += rng.choice([0.0, 0.2, -0.2]) if n > 1 else 0.0
+    terms = (0, 1, 2, 5, 6) if n > 1 else (1, 2, 5)
+    f = drift(rng, n, terms=terms, clock=bool(rng.random() < 0.2), pushed=False, pull=rng.uniform(0.0, 1.0))
+    if not step:
+        return cb.ContinuousSystem(f, states=n, diffusion=gain)
+    noise = cb.Gaussian(covariance=step * gain @ gain.T)
+    moved = lambda t, x: [x[k] + step * v for k, v in enumerate(f(step * t, x))]  # noqa: E731
+    return cb.DiscreteSystem(moved, states=n, noise=noise)
 
 
-def targets(rng: Random) -> cb.Problem:
-    """A box, a ball or a half-space to be reached from a point or a small box."""
-    low, high = -rng.uniform(0.8, 1.3, 2), rng.uniform(0.8, 1.3, 2)
-    center, kind = rng.uniform(-0.3, 0.3, 2), rng.integers(4)
-    sides = rng.uniform(0.2, 0.45, 2)
+def targets(rng: Random, n: int = 2, step: float = 0.0) -> cb.Problem:
+    """A box, a ball or a half-space to be reached from a point or a small box; with a ``step`` in discrete time."""
+    low, high = -rng.uniform(0.8, 1.3, n), rng.uniform(0.8, 1.3, n)
+    center, kind = rng.uniform(-0.3, 0.3, n), rng.integers(4)
+    sides = rng.uniform(0.2, 0.45, n)
     region: Any = cb.Box(center - sides, center + sides)
     if kind == 0:
         region = cb.Ball(center, float(sides[0]))
     if kind == 1:
-        region = cb.HalfSpace([float(rng.choice([-1.0, 1.0])), 0.0], -float(rng.uniform(0.2, 0.5)))
-    place = rng.choice([-1, 1], 2) * rng.uniform(0.45, 0.65, 2)
-    start = cb.Box(place, place + rng.choice([0.0, 0.08], 2))
+        region = cb.HalfSpace([float(rng.choice([-1.0, 1.0])), 0.0][:n], -float(rng.uniform(0.2, 0.5)))
+    place = rng.choice([-1, 1], n) * rng.uniform(0.45, 0.65, n)
+    start = cb.Box(place, place + rng.choice([0.0, 0.08], n))
     horizon = float(rng.choice([0.7, 2.0, 4.0]))
-    return cb.Problem(_system(rng), initial=start, safe=[cb.Inside(cb.Box(low, high))], reach=region, horizon=horizon)
+    horizon = round(horizon / step) if step else horizon
+    safe = [cb.Inside(cb.Box(low, high))]
+    return cb.Problem(_system(rng, n, step), initial=start, safe=safe, reach=region, horizon=horizon)
 
 
 def windows(rng: Random) -> cb.Problem:

@@ -11,6 +11,8 @@ from certbound.errors import InfeasibleError
 from certbound.problem.goals import until
 from certbound.problem.model import compile_numpy
 from certbound.values.continuous import bound_exits, exits
+from certbound.values.continuous.curved import ramps_for
+from certbound.values.continuous.hypotheses import extreme_over
 from certbound.values.continuous.plane import frames
 from certbound.values.continuous.plane import plane_targets as targets
 from certbound.values.continuous.plane import plane_windows as windows
@@ -19,6 +21,7 @@ from tests.values.random_goals import KINDS, check
 
 SQUARE = cb.Inside(cb.Box([-1, -1], [1, 1]))
 LATE = math.log(0.4161), math.log(0.4281)  # 99.99 % limits from 100,000 simulated paths of `walk` with its target
+TOGETHER = math.log(0.2497), math.log(0.2605)  # the same of correlated noise from (.7, .7) into [-.4, .4]^2 within 1
 NARROW = math.log(0.3707), math.log(0.3825)  # the same of `walk` for 2 from (.1, .1), |x|, |y| <= .6 from 1 on
 
 SPOILT = ((0.0, -0.5), (1e-3, 0.0))
@@ -67,6 +70,32 @@ def test_no_proposal_makes_a_bound_with_a_target_that_is_wrong(aimed, size, shif
     assert targets.prove_failing_above(spoilt(upper, size, shift), above)[1].log >= LATE[0]
     least = targets.prove_failing_below(spoilt(lower, size, shift), below)
     assert least is None or least.log <= LATE[1]
+
+
+@pytest.mark.parametrize("upper", [True, False])
+def test_proposals_of_arriving_are_bent_where_noises_go_together_and_hold_simulations(upper):
+    gain = [[0.4, 0.25], [0.0, 0.4]]
+    system = cb.ContinuousSystem(lambda x: [-x[0] + 0.3 * x[1], -x[1] - 0.3 * x[0]], states=2, diffusion=gain)
+    problem = cb.Problem(system, initial=[0.7, 0.7], safe=[SQUARE], horizon=1.0)
+    aim = targets._aim(problem, exits._model(problem), cb.Box([-0.4, -0.4], [0.4, 0.4]), upper=upper)
+    solver = ramps_for(aim.plane, aim.target, 10, upper)
+    assert solver.corners == [(0, 0), (1, 1)]
+    surface = solver.failing(None)
+    off = surface.values[:, [0, -1], 0, [0, -1], 0]
+    assert np.all(off > 0) if upper else np.all(off < 0)
+    for shift in (0.0, -0.2 * targets._LITTLE, 50 * targets._LITTLE):
+        _, payment, _ = targets._proved(surface.raised(shift), aim)
+        assert payment is None or (payment.log >= TOGETHER[0] if upper else payment.log <= TOGETHER[1])
+
+
+def test_a_start_on_a_line_of_the_grid_is_read_on_that_line(aimed):
+    surface = aimed[0][1]
+    nodes = surface.axes[0]
+    line = [(float(nodes[4]),) * 2, (0.41, 0.43)]
+    above = extreme_over(surface, line, upper=True)
+    wide = extreme_over(surface, [(float(nodes[3]), float(nodes[5])), line[1]], upper=True)
+    seen = surface.floor_at(0, np.column_stack([np.full(9, nodes[4]), np.linspace(0.41, 0.43, 9)]))
+    assert seen.max() <= above < wide
 
 
 def test_a_start_that_may_lie_in_the_target_has_no_lower_bound(aimed):

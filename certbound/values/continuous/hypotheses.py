@@ -374,9 +374,8 @@ def extreme_over(
 ) -> float:
     """The supremum of V(0, .) over the starts (upper), or V at the best of the nodes among them, rounded safely.
 
-    Starts that are no union of cells are covered by the cells that they touch. Where a start is a node of the grid in
-    every state, V there is one of the data. Starts that stick out of the grid give infinity. Where the starts do not
-    fill their box, only ``points`` among them count from below.
+    Starts are covered by the cells, or by those of a line of the grid, that they touch; at a node V is one of the
+    data. Starts that stick out of the grid give infinity. Only ``points``, if any, count from below.
     """
     if any(low < axis[0] or high > axis[-1] for axis, (low, high) in zip(surface.axes, starts)):
         return math.inf if upper else -math.inf
@@ -384,14 +383,15 @@ def extreme_over(
         return float(surface.floor_at(0, points).max(initial=-math.inf))
     exact = [np.flatnonzero((axis >= low) & (axis <= high)) for axis, (low, high) in zip(surface.axes, starts)]
     index = np.ix_(*itertools.chain.from_iterable((nodes, [0]) for nodes in exact))
-    at_nodes = float(surface.values[0][index].max()) if all(len(nodes) for nodes in exact) else -math.inf
-    low, high = surface.range_at(0)
-    touched = np.ix_(*(_touched(axis, *ends) for axis, ends in zip(surface.axes, starts)))
-    if upper:
-        if all(low == high for low, high in starts) and at_nodes > -math.inf:
-            return at_nodes
-        return float(high[touched].max())
-    return max(at_nodes, float(low[touched].max()))
+    at_nodes = float(surface.values[0][index].max()) if all(map(len, exact)) else -math.inf
+    touched = [_touched(axis, *ends) for axis, ends in zip(surface.axes, starts)]
+    if not upper:
+        return max(at_nodes, float(surface.range_at(0)[0][np.ix_(*touched)].max()))
+    line = [(axis, int(nodes[0])) for axis, (nodes, (a, b)) in enumerate(zip(exact, starts)) if a == b and len(nodes)]
+    if len(line) in (0, len(starts)):
+        return at_nodes if line else float(surface.range_at(0)[1][np.ix_(*touched)].max())
+    touched.pop(line[0][0])
+    return float(surface.across(*line[0], begin=True)[1][0][np.ix_(*touched)].max())
 
 
 def _touched(axis: Array, low: float, high: float) -> Index:

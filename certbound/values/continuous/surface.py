@@ -222,11 +222,13 @@ class Surface:
         """Bounds of V on the cells of one face of the grid, shape (K, *cells along the other states)."""
         return self.across(axis, -side)
 
-    def across(self, axis: int, node: int) -> tuple[Array, Array]:
-        """The same where a state is at one of its nodes."""
+    def across(self, axis: int, node: int, *, begin: bool = False) -> tuple[Array, Array]:
+        """The same where a state is at one of its nodes; ``begin``: V is in the first slab what it is at its start."""
         index: tuple[Any, ...] = (slice(None), *((slice(None),) * (2 * axis)), node, 0)
         parts = [self.values[:-1], self.start_rates, self.values[1:], self.end_rates]
         data = np.stack([part[index] for part in parts], axis=1)
+        if begin:
+            data[0, 1::2], data[0, 2] = 0.0, data[0, 0]
         rest = tuple(nodes for k, nodes in enumerate(self.axes) if k != axis)
         low, high = value_range(_patches_of(data, self.steps, rest))
         shape = (self.slabs, *(len(nodes) - 1 for nodes in rest))

@@ -38,7 +38,7 @@ class WalledRamps(Ramps):
         super().__init__(plane, cells, _lead(plane, cells))
         self.points = [(nodes[:-1, None] + np.diff(nodes)[:, None] * _PLACES).ravel() for nodes in self.nodes]
         x, y = np.meshgrid(*self.points, indexing="ij")
-        self.asked = np.asarray(walls.depth(x, y) > 0).ravel()
+        self.asked = self.due(x, y).ravel()
         own = [[csr_matrix(one.spline(at, order)) for order in range(3)] for one, at in zip(self.splines, self.points)]
         (force,), a = plane.drift(0.0, x, y), plane.square(0.0, x, y) * np.ones((2, 2, *x.shape))
         force = self._weakened(force, a, (x, y))
@@ -58,6 +58,10 @@ class WalledRamps(Ramps):
 
     def grid(self, axis: int, plan: Plan) -> Array:
         return crowded_nodes(self.plane, plan, axis, self.curve, _CROWD)
+
+    def due(self, x: Array, y: Array) -> Mask:
+        """Where the equation is asked for."""
+        return np.asarray(self.walls.depth(x, y) > 0)
 
     def least(self, whole: Surface) -> float:
         assert isinstance(self.walls, Walls)

@@ -64,11 +64,12 @@ _COARSE = 24
 _SHARES = (0.12, 0.5)  # of the patches, for one grid after the other
 _BEYOND = 0.6  # of the paths' extent, where nothing bounds a state
 INVERSE = 2.0**8  # 1 / e of V = -e Q
-_FACTORS = (0.6, 0.9, 1.12, 1.12, 1.5, 3.0)  # of the residual, for one source after the other
+_FACTORS = (0.6, 0.9, 1.12, 1.12, 1.5, 2.0, 3.0, 4.0)  # of the residual, for one source after the other
 _SAMPLED = 3  # of which samples tell
 _WORSE = 3.0  # times the least residual of those before: sources do not help any more
-_COST, _MOST = 0.009, 56  # seconds of both sides, over cells^2, and most cells
-_BELOW = (28, 20, 16)  # cells for lower bounds, one after the other: on finer grids sources feed each other
+_LITTLE = 0.02 / INVERSE  # a residual, summed over the horizon, that is never too much
+_COST, _MOST = 0.015, 44  # seconds of both sides, over cells^2, and most cells
+_BELOW = 28, 20  # the most cells for lower bounds, and those that are tried where there is none
 _DEEP = 0.25  # of the box's width: how deep the box reaches into a target that takes up one of its sides
 
 
@@ -236,31 +237,35 @@ def _corrected(aim: Aim, solver: Solves) -> Proposed | None:
     source: Source | None = None
     best: Proposed | None = None
     sign, least = (1.0, math.inf) if aim.upper else (-1.0, math.inf)
-    for number, factor in enumerate(_FACTORS):
-        surface = solver.failing(source)
-        if not covers(surface, aim.plane.horizon, aim.plane.low, aim.plane.high, within=aim.upper):
-            break
-        sketch, fate = _Sketch.of(surface, aim, granted=0.0), Fate.of(surface.axes, aim.target)
-        over = ~fate.alive if aim.upper else fate.met
-        due = (sketch.level < 0 if aim.upper else sketch.level > _around(surface, over)[1]) & ~over
-        needed = np.where(due, sketch.excess, 0.0)
-        paid = float(needed.max(axis=(1, 2)) @ surface.steps)
-        if not math.isfinite(paid) or paid > _WORSE * least:
-            break
-        least = min(least, paid)
-        if number >= _SAMPLED and paid < -surface.values[0].min(initial=0.0):
-            made, payment, proof = _proved(surface, aim)
-            if payment is not None and (best is None or sign * payment.log < sign * best[1].log):
-                best = made, payment
-            if proof is not None:
-                excess = proof.ranges.residual_high if aim.upper else -proof.ranges.residual_low
-                table = np.zeros((surface.slabs, over.size))
-                table[proof.slab, proof.cell] = np.where(proof.ranges.low < 0, np.maximum(excess, 0.0), 0.0)
-                needed = table.reshape(needed.shape)
-            if not np.isfinite(needed).all():
+    try:
+        for number, factor in enumerate(_FACTORS):
+            surface = solver.failing(source)
+            if not covers(surface, aim.plane.horizon, aim.plane.low, aim.plane.high, within=aim.upper):
                 break
-        more = Source.above(surface, factor * needed * INVERSE)
-        source = more if source is None else source.plus(more)
+            sketch, fate = _Sketch.of(surface, aim, granted=0.0), Fate.of(surface.axes, aim.target)
+            over = ~fate.alive if aim.upper else fate.met
+            due = (sketch.level < 0 if aim.upper else sketch.level > _around(surface, over)[1]) & ~over
+            needed = np.where(due, sketch.excess, 0.0)
+            paid = float(needed.max(axis=(1, 2)) @ surface.steps)
+            if not math.isfinite(paid) or paid > _WORSE * max(least, _LITTLE):
+                break
+            least = min(least, paid)
+            if number >= _SAMPLED and paid < -surface.values[0].min(initial=0.0):
+                made, payment, proof = _proved(surface, aim)
+                if payment is not None and (best is None or sign * payment.log < sign * best[1].log):
+                    best = made, payment
+                if proof is not None:
+                    excess = proof.ranges.residual_high if aim.upper else -proof.ranges.residual_low
+                    table = np.zeros((surface.slabs, over.size))
+                    table[proof.slab, proof.cell] = np.where(proof.ranges.low < 0, np.maximum(excess, 0.0), 0.0)
+                    needed = table.reshape(needed.shape)
+                if not np.isfinite(needed).all():
+                    break
+            more = Source.above(surface, factor * needed * INVERSE)
+            source = more if source is None else source.plus(more)
+    except OutOfTime:
+        if best is None:
+            raise
     return best
 
 
@@ -295,7 +300,7 @@ def bound_failing(
     above, below = list[Proposed](), list[Proposed]()
     if target.form.axial and aims[0].plane.autonomous and len(model.branches) == 1:
         cells = min(max(round(math.sqrt(patches / RATE / _COST)), _FEWEST), _MOST)
-        for aim, kept, number in ((aims[0], above, cells), *((aims[1], below, n) for n in _BELOW if n <= cells)):
+        for aim, kept, number in ((aims[0], above, cells), *((aims[1], below, min(n, cells)) for n in _BELOW)):
             with contextlib.suppress(OutOfTime, RuntimeError, ValueError):  # a singular system, numbers that overflow
                 found = None if kept else _corrected(aim, likely(aim.plane, target, number, aim.upper))
                 kept += [] if found is None else [found]

@@ -77,6 +77,8 @@ class Ramps:
     solved is larger by ``margin`` times their correlation, in cells beside a face. ``finely`` asks for shorter steps.
     """
 
+    shift = SHIFT
+
     def __init__(
         self, plane: Plane, cells: int, lead: float, margin: float = 0.0, *, eased: bool = False, below: bool = False,
         finely: bool = False,
@@ -160,7 +162,7 @@ class Ramps:
 
     def surface(self, source: Source | None, *, below: bool) -> Surface:
         """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
-        horizon, shift = self.plane.horizon, 0.0 if below else SHIFT * self.lead
+        horizon, shift = self.plane.horizon, 0.0 if below else self.shift * self.lead
         times, first = _times(horizon, shift, self.lead, self.longest)
         sign = -1.0 if below else 1.0
         given = None if source is None else sign * self.fed(source)
