@@ -57,6 +57,10 @@ def _with(text: str, *pairs: tuple[str, str]) -> str:
 
 
 LOOSE = FLOW.replace("delta = 0.3", "delta = 0.9")
+PLANE = _with(
+    LOOSE, ('["x"]', '["x", "y"]'), ('x = "-x"', 'x = "-x"\ny = "-y"'), ("[[0.4]]", "[[0.4, 0], [0, 0.4]]"),
+    ("[0.2]", "[0.2, 0.1]"), ("[-1, 1]", "[-1, 1], y = [-1, 1]"),
+)  # fmt: skip
 INSIDE = "box = { x = [-1, 1] }"
 ENDS = (INSIDE, "box = { x = [-0.6, 3] }"), ("[init", "[domain]\nbox = { x = [-2, 0.9] }\nleaving = 'ends'\n[init")
 QUICK = ("union", "target", "polygon", "packets", "forever", "growth", "staying", "ruin", "sampled")
@@ -82,11 +86,17 @@ ROWS: dict[str, str] = {name: STARTERS[name] for name in QUICK} | {
     "triangular": _with(PLAIN, (LAW, 'law = "triangular"\nhalfwidth = 0.6')),
     "ends": _with(PLAIN, *ENDS),
     "ends in continuous time": _with(FLOW, *ENDS),
+    "windows in the plane": PLANE + "[[stay]]\nbox = { x = [-0.6, 0.7], y = [-0.8, 0.8] }\nduring = [0.6, 1]\n",
+    "target in the plane": PLANE + "[[reach]]\nbox = { x = [-0.3, 0.1], y = [-0.3, 0.3] }\n",
+    "ends in the plane": _with(
+        PLANE, ("x = [-1, 1], y = [-1, 1]", "x = [-0.6, 3], y = [-3, 3]"),
+        ("[init", "[domain]\nbox = { x = [-2, 0.9], y = [-1, 1] }\nleaving = 'ends'\n[init"),
+    ),
     "a target for ever": _with(FLOW, ("horizon = 1", "horizon = inf")) + "[[reach]]\nbox = { x = [-0.3, 0] }\n",
 }  # fmt: skip
 
-SLOW = ("a long horizon", "a model that jumps in time", "sampled")
-METHODS = {name: "values" for name in ROWS if name.endswith(("continuous time", "for ever"))}
+SLOW = ("a long horizon", "a model that jumps in time", "sampled", *(name for name in ROWS if name.endswith("plane")))
+METHODS = {name: "values" for name in ROWS if name.endswith(("continuous time", "for ever", "plane"))}
 BELOW = ("ends", "triangular")
 METHODS |= {"ruin": "values", "union": "linear"}
 OWN = {"discrete": "values", "continuous": "linear"}
