@@ -77,7 +77,11 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
             raise CertificateError("certificates state no lower bounds where constants are drawn.")
         return averaged(problem, cells, [_stated(one, attempt) for one in cells])
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
-        return _lower_data(problem, verdict, attempt)
+        try:
+            return _lower_data(problem, verdict, attempt)
+        except CertificateError:
+            if not any(one.applicable and one.log10_delta < 0 for one in verdict.answers.values()):
+                raise
     if members:
         return united(problem, [certificate_data(one.problem, one, attempt=attempt) for one in members])
     refusals: list[str] = []

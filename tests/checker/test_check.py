@@ -186,7 +186,7 @@ def test_stated_constants_are_named_as_an_assumption() -> None:
 def test_a_bound_above_delta_says_so() -> None:
     system = cb.DiscreteSystem(lambda x: [0.5 * x[0]], states=1, noise=cb.Gaussian(std=0.4))
     problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3, delta=1e-6)
-    verdict, report = checked(problem, "linear")
+    verdict, report = checked(problem, "constants")
     assert verdict.status == "UNKNOWN"
     assert report.valid
     assert "more than delta" in report.claim

@@ -63,7 +63,7 @@ AgainstOption = Annotated[Path | None, option("--against", "CERT", "Does the sim
 
 def simulate(
     problem: ProblemArgument,
-    paths: PathsOption = 100_000,
+    paths: PathsOption,
     pairs: SetOption = None,
     horizon: HorizonOption = None,
     seed: SeedOption = None,

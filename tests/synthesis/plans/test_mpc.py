@@ -82,7 +82,7 @@ def test_an_infeasible_problem_says_why_and_what_would_do(problem: cb.Problem) -
 def test_a_response_that_does_not_fit_is_no_proof() -> None:
     found = cb.synthesize_plan(cart(std=0.3, delta=1e-6), method="linear")
     assert not found.feasible
-    assert found.status == "UNKNOWN"
+    assert found.status in ("UNKNOWN", "UNSAFE")
     assert found.infeasibility is not None
     assert not found.infeasibility.proved
     assert "not a proof" in found.reason
