@@ -80,7 +80,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         try:
             return _lower_data(problem, verdict, attempt)
         except CertificateError:
-            if not any(one.applicable and one.log10_delta < 0 for one in verdict.answers.values()):
+            if not _cannot_be_written(problem, verdict):
                 raise
     if members:
         return united(problem, [certificate_data(one.problem, one, attempt=attempt) for one in members])
@@ -220,20 +220,28 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
 
 
 def _answers_below(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
-    """Engines whose lower bounds are more than delta, the best first; then those that had too little time for that."""
-
-    def refuting(name: str, answer: EngineAnswer | None) -> list[tuple[float, str, EngineAnswer]]:
-        if answer is None or not answer.applicable or answer.log10_lower is None:
-            return []
-        return [(-answer.log10_lower, name, answer)] if is_more_than(answer.log10_lower, problem.delta) else []
-
-    found = [row for item in verdict.answers.items() for row in refuting(*item)]
-    yield from ((name, answer) for _, name, answer in sorted(found, key=lambda row: row[0]))
+    """Engines with a lower bound, the best first; others are asked where it refutes and cannot be written."""
+    found = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_lower is not None]
+    yield from sorted(found, key=lambda item: -(item[1].log10_lower or 0.0))
+    if not _cannot_be_written(problem, verdict):
+        return
     known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
     for name, row in ENGINES.items():
-        if row.write_below is not None and name not in {name for _, name, _ in found}:
+        asked = verdict.answers.get(name)
+        if row.write_below is not None and (asked is None or asked.log10_lower is None):
             answer = known[name] = known[name] if name in known else _asked_now(problem, name)
-            yield from (row[1:] for row in refuting(name, answer))
+            if answer.applicable and _refutes(problem, answer):
+                yield name, answer
+
+
+def _cannot_be_written(problem: Problem, verdict: Answered) -> bool:
+    """Whether the lower bounds that refute delta are all of engines whose lower bounds certificates do not state."""
+    refuting = [name for name, answer in verdict.answers.items() if _refutes(problem, answer)]
+    return bool(refuting) and all(ENGINES[name].write_below is None for name in refuting)
+
+
+def _refutes(problem: Problem, answer: EngineAnswer) -> bool:
+    return answer.log10_lower is not None and is_more_than(answer.log10_lower, problem.delta)
 
 
 def _asked_now(problem: Problem, name: str) -> EngineAnswer:
