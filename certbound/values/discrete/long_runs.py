@@ -44,7 +44,7 @@ _LONG = 400
 _MOST = 20_000  # steps back on one grid
 _LOST = 1e-3  # of the largest probability of being safe: cells with less are rounded
 _SOON, _AT_LEAST, _NEGLIGIBLE = 32, 1024, 1e-17
-_BETTER = 0.9  # of the gap: what twice as many steps back have to make of it
+_BETTER, _LESS = 0.9, 0.5  # of the gap, or of the upper bound: what twice as many steps back have to make of it
 _DEAR, _BRIEF = 3, 2.0  # states from which on a step back is dear, and seconds at fixed rates of those that matter
 _CHECKED, _OFTEN = 1.2, 1.04  # steps back between two looks at the bounds, as a ratio; and where looks need no rates
 _ANSWERED = 1.25  # times the ratio asked for, once the probability is low enough and steps are dear
@@ -210,7 +210,7 @@ class _Run:
         They need not be closer than asked where the probability ``brief[0]`` holds after ``brief[1]`` steps or more.
         """
         best: FailureBounds | None = None
-        ahead, look, gap = self.horizon - self.first, 4.0, (0, math.inf)
+        ahead, look, before = self.horizon - self.first, 4.0, (0, math.inf, 1.0)
         zones = self.work.zones(grid, 0)
         transition = self.work.transition(0, grid, grid, share)
         above = final(grid, zones, above=True)
@@ -222,12 +222,13 @@ class _Run:
                 poll(f"values {n} steps back, {math.prod(grid.shape)} cells")
                 found = self._read(transition, zones, (above, below), n, share)
                 best, self.steps = found if best is None else _better(best, found), n
-                wide, twice = _gap(best), n >= 2 * gap[0]
-                vain = twice and self._stalls(best, n) and wide > _BETTER * gap[1]
+                wide, twice = _gap(best), n >= 2 * before[0]
+                slow = wide > _BETTER * before[1] and best.upper > _LESS * before[2]
+                vain = twice and slow and self._stalls(best, n)
                 answered = best.upper <= brief[0] and n >= brief[1]
                 if last or vain or wide <= (ratio - 1) * (_ANSWERED if answered else 0.25):
                     break
-                gap = (n, wide) if twice else gap
+                before = (n, wide, best.upper) if twice else before
             above, below = back_above(transition, above, zones), back_below(transition, below, zones)
         assert best is not None
         return best

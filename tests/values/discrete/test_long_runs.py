@@ -84,6 +84,14 @@ def test_for_ever_a_target_is_met_or_missed():
     assert found.lower <= truth <= found.upper <= 1.1 * found.lower
 
 
+def test_a_target_that_is_nearly_sure_is_waited_for():
+    """Nothing from below, and an upper bound that falls slowly in its logarithm: it falls nevertheless."""
+    system = cb.DiscreteSystem(lambda x: x - 0.5, states=["x"], noise=cb.Uniform(halfwidth=1.5))
+    safe = [cb.Inside(cb.HalfSpace([1], 40))]
+    missed = cb.Problem(system, initial=[3.0], safe=safe, horizon=math.inf, reach=cb.HalfSpace([1], 0))
+    assert bound_long_run(missed, seconds=0.3).upper < 1e-6
+
+
 def test_where_steps_are_dear_they_end_once_delta_holds(monkeypatch):
     monkeypatch.setattr(long_runs, "_DEAR", 1)
     monkeypatch.setattr(long_runs, "_BRIEF", 0.0)
