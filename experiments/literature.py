@@ -58,7 +58,8 @@ LITERATURE = {
     "delivery_impact": "none found; here the second leg, start and policy of our own",
     "delivery_julia": "the same, with ten times the variance and inputs without bounds",
     "delivery_syscore": "the same, with ten times the variance and other matrices",
-    "van_der_pol_arch": "none found; here the target is met once, not again and again",
+    "van_der_pol_arch": "none found; here the target is met once, not again and again; missing: cells as small as this "
+    "noise in so wide a box, or starts in parts that arrive at times of their own",
     "van_der_pol_impact": "the same, with (1 - x)^2 for 1 - x^2 and other noise",
     "vehicle_impact": "IMPaCT: 286 s of synthesis; here start and policy of our own",
     "vehicle_julia": "the same, without x + 0.1 times the rest",
