@@ -106,7 +106,7 @@ def bound_long_run(
         left -= run.steps * cost
         tried.append((share, found.upper, found.lower))
         best = found if best is None else _better(best, found)
-        if _gap(best) <= ratio - 1 or (delta is not None and (best.upper <= delta / 100)):
+        if run.ended or _gap(best) <= ratio - 1 or (delta is not None and (best.upper <= delta / 100)):
             break
     if best is None:
         raise Inapplicable(run.work.too_large)
@@ -200,7 +200,7 @@ class _Run:
                 "`domain`."
             )
         self.first = 0 if self.work.random else 1
-        self.steps = 0
+        self.steps, self.ended = 0, False  # whether time ended a grid, of which the last bounds hold
 
     def bounds(
         self, grid: Grid, share: float, ratio: float, most: float, brief: tuple[float, float]
@@ -215,21 +215,26 @@ class _Run:
         transition = self.work.transition(0, grid, grid, share)
         above = final(grid, zones, above=True)
         below = final(grid, replace(zones, has_target=False), above=False)
-        for n in itertools.count():
-            last = n >= min(ahead, most, _MOST)
-            if n >= look or last:
-                look = (_CHECKED if self.target is None else _OFTEN) * n
-                poll(f"values {n} steps back, {math.prod(grid.shape)} cells")
-                found = self._read(transition, zones, (above, below), n, share)
-                best, self.steps = found if best is None else _better(best, found), n
-                wide, twice = _gap(best), n >= 2 * before[0]
-                slow = wide > _BETTER * before[1] and best.upper > _LESS * before[2]
-                vain = twice and slow and self._stalls(best, n)
-                answered = best.upper <= brief[0] and n >= brief[1]
-                if last or vain or wide <= (ratio - 1) * (_ANSWERED if answered else 0.25):
-                    break
-                before = (n, wide, best.upper) if twice else before
-            above, below = back_above(transition, above, zones), back_below(transition, below, zones)
+        try:
+            for n in itertools.count():
+                last = n >= min(ahead, most, _MOST)
+                if n >= look or last:
+                    look = (_CHECKED if self.target is None else _OFTEN) * n
+                    poll(f"values {n} steps back, {math.prod(grid.shape)} cells")
+                    found = self._read(transition, zones, (above, below), n, share)
+                    best, self.steps = found if best is None else _better(best, found), n
+                    wide, twice = _gap(best), n >= 2 * before[0]
+                    slow = wide > _BETTER * before[1] and best.upper > _LESS * before[2]
+                    vain = twice and slow and self._stalls(best, n)
+                    answered = best.upper <= brief[0] and n >= brief[1]
+                    if last or vain or wide <= (ratio - 1) * (_ANSWERED if answered else 0.25):
+                        break
+                    before = (n, wide, best.upper) if twice else before
+                above, below = back_above(transition, above, zones), back_below(transition, below, zones)
+        except OutOfTime:
+            if best is None:
+                raise
+            self.ended = True
         assert best is not None
         return best
 

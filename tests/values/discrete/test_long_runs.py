@@ -12,6 +12,7 @@ from certbound.values.discrete import bound_failure, bound_long_run, long_runs
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.long_runs import largest_rate, least_rate
 from certbound.values.grids import Grid
+from certbound.watch import OutOfTime
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(240)
 
@@ -98,6 +99,20 @@ def test_where_steps_are_dear_they_end_once_delta_holds(monkeypatch):
     brief, whole = (bound_long_run(walk(), seconds=0.1, delta=delta, ratio=1.3) for delta in (0.9, 1e-6))
     assert brief.before[0] < whole.before[0]
     assert brief.lower <= whole.lower <= whole.upper <= brief.upper < 1.46 * brief.lower  # e^(1.25 of .3)
+
+
+def test_what_was_proved_until_time_ended_is_kept(monkeypatch):
+    asked = []
+
+    def ended(phase):
+        asked.append(phase)
+        if len(asked) == 3:
+            raise OutOfTime
+
+    monkeypatch.setattr(long_runs, "poll", ended)
+    found = bound_long_run(walk(), seconds=0.6)
+    assert len(asked) == 3
+    assert 0 < found.lower < found.upper < 1
 
 
 def test_two_states_for_ever():
