@@ -127,10 +127,10 @@ def _benchmarks(head: str) -> str:
 {head}
 Each problem is a file in `experiments/benchmarks/`, with its source in a comment; run one with
 `certbound verify experiments/benchmarks/room_3d.toml`. The published numbers are those of the tools' own papers, on
-their machines and with their solvers. Where the true probability of leaving is large the right answer is UNSAFE,
-or UNKNOWN with what could be proved. Leaving the model's domain counts as leaving here, and does not there. Every search has
-{LIMIT:g} seconds of processor time. `simulated` is the share of failures in {PATHS} paths, whose starts are drawn from
-the set; what is proved holds for the worst of them. `>=` is what is proved from below, where something is.
+their machines and with their solvers. Where the true probability of leaving is large the right answer is UNSAFE, or
+UNKNOWN with what could be proved. Leaving the model's domain counts as leaving here, and does not there. Every search
+has {LIMIT:g} seconds of processor time. `simulated` is the share of failures in {PATHS} paths, whose starts are drawn
+from the set; what is proved holds for the worst of them. `>=` is what is proved from below, where something is.
 
 {found}
 
