@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -123,3 +124,22 @@ def test_what_the_checker_does_not_prove_is_no_certificate(monkeypatch: pytest.M
     problem = cb.load("ou")
     with pytest.raises(CertificateError, match=r"no certificate could be proved .* nothing is left for the noise"):
         proved_certificate(problem, verify_safety(problem, method="constants"))
+
+
+def test_where_nothing_is_proved_simulated_paths_are_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unknown = [*OU, "--set", "radius=0.8", "--delta", "1e-4"]
+    assert run(unknown) == 1
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert re.fullmatch(r"simulated, which proves nothing: 1\d\d of 1000 paths failed, more often than 0.0001", last)
+    for quieter in ("--json", "--quiet"):
+        assert run([*unknown, quieter]) == 1
+        assert "simulated" not in capsys.readouterr().out
+
+    def broken(*_: Any, **__: Any) -> None:
+        raise ValueError("the noise has no law")
+
+    monkeypatch.setattr("certbound.simulation.estimates.simulate_exits", broken)
+    assert run(unknown) == 1
+    assert capsys.readouterr().out.splitlines()[-1].startswith("method")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import sys
 import time
+import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -36,7 +38,7 @@ from certbound.cli.output import SETTINGS, console, print_status, show, spinner,
 from certbound.cli.pictures import check_picture, drawn_reach, scene_of, values_of, write_picture
 from certbound.cli.progress import progress
 from certbound.display import at_least_text, log10_text, name_text, one_line, rounded
-from certbound.errors import CertificateError, EngineError, contained
+from certbound.errors import CertificateError, EngineError, SolverError, contained
 from certbound.watch import OutOfTime, Watch
 
 if TYPE_CHECKING:
@@ -52,6 +54,8 @@ EXAMPLES = examples(
 
 DEFAULT_LIMIT = 60.0
 _LEAST = 1e-3
+_PATHS, _LONG = 1000, 10_000  # simulated where nothing was proved; steps that take too long for that
+_PATIENCE, _BEYOND = 3.0, 0.5  # seconds of it, and beyond a limit of time
 
 MethodOption = Annotated[
     str,
@@ -112,6 +116,9 @@ def verify(
         result["taken"] = list(notes(problem))
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
         _print(subject, result, verdict.caution)
+        if verdict.status == "UNKNOWN" and not SETTINGS.quiet:
+            hint = _simulated(subject, math.inf if time_limit is None else clock.left)
+            console().print(hint, markup=False, end="\n" if hint else "")
     if explain and verdict.status in ("UNKNOWN", "UNSAFE"):
         result["limits"] = _limits(verdict, cells, clock)
         if not as_json and not SETTINGS.quiet:
@@ -127,6 +134,25 @@ def verify(
     _write(subject, verdict, proof, report=report, plot=plot)
     show(result, as_json, lambda: None)
     raise typer.Exit(0 if verdict.status == "SAFE" else 1)
+
+
+def _simulated(problem: Problem, left: float) -> str:
+    """What some simulated paths suggest where nothing was proved; empty where they would be dear, or tell nothing."""
+    if problem.horizon > _LONG:
+        return ""
+    try:
+        with spinner("simulating some paths"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            from certbound.simulation.estimates import simulate_exits
+
+            with Watch(min(max(left, 0.0) + _BEYOND, _PATIENCE)).running():
+                found = simulate_exits(problem, paths=_PATHS, rng=0)
+    except (ArithmeticError, OutOfTime, SolverError, ValueError):
+        return ""
+    text = f"simulated, which proves nothing: {found.exits} of {found.paths} paths failed"
+    if found.refutes(problem.delta):
+        return f"{text}, more often than {problem.delta!r}"
+    return text if found.upper > problem.delta else f"{text}, less often than {problem.delta!r}"
 
 
 def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:
