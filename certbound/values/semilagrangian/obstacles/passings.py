@@ -7,6 +7,9 @@ obstacle, and let p not be in [p0, p1] before the time t. A path that meets the 
 
     P(meets it, ends outside) <= P(Z <= 0 at some time in [t, h]) - P(Z_h <= 0) + P(Z_h < -depth).
 
+Each holds on the event of `remainders`; what is taken off may be too much by its share, for which `leaving._RARE` has
+room.
+
 *The first*: Z is at least the solution Y of dY = (push - pull Y) dt + s dW, Y_0 the least Z of the starts, since Z' is
 at least that on the tube. Y_t is normal. From y > 0 on, Y meets 0 with a probability of at most c(y) (`meeting`), which
 falls: its mean is at most the sum of c's falls at y_1 < y_2 < ... times P(Y_t < y_i), with c = 1 up to 0.
