@@ -28,10 +28,12 @@ _ANGLES = (0.3, 0.6, 0.9)  # of the corners of a box in a ball, seen from its ce
 class Breach:
     """At node k + offset a constraint is broken where all rows[j, k] . s > levels[j, k], s = X - p: (J, K, n), (J, K).
 
-    ``asked`` (K,) tells at which nodes the constraint holds at all. ``label`` names it.
+    ``asked`` (K,) tells at which nodes the constraint holds at all. ``label`` names it, and
+    ``place`` is its number and that of the way to break it: the same on all grids.
     """
 
     label: str
+    place: tuple[int, int]
     rows: Array
     levels: Array
     asked: Mask
@@ -46,7 +48,7 @@ def breaches(engine: Linearisation) -> list[Breach]:
     nodes, times = engine.nodes[0, first_node:], engine.times[first_node:]
     slip = 4e-15 * float(times[-1]) * engine.continuous  # the nodes are floats near k h, the last one is the horizon
     span = Interval(times - slip, times + slip)
-    for constraint in engine.problem.safe:
+    for number, constraint in enumerate(engine.problem.safe):
         asked = np.ones(len(times), dtype=bool)
         if constraint.during is not None:
             first, last = constraint.during
@@ -54,8 +56,9 @@ def breaches(engine: Linearisation) -> list[Breach]:
             asked[-1] = first <= float(engine.problem.horizon) <= last
         region = constraint.region
         y = Interval.point(nodes[:, region.places(engine.n)]) - centre_over(region, span)
-        for rows, levels in (_met if constraint.outside else _left)(region, y, engine) if asked.any() else ():
-            found.append(Breach(label=constraint.label, rows=rows, levels=levels, asked=asked))
+        ways = (_met if constraint.outside else _left)(region, y, engine) if asked.any() else []
+        for way, (rows, levels) in enumerate(ways):
+            found.append(Breach(label=constraint.label, place=(number, way), rows=rows, levels=levels, asked=asked))
     return found
 
 

@@ -130,6 +130,8 @@ def _attempts(problem: Problem) -> Iterator[_Attempt]:
     """Those that are worth a proof, in turn."""
     engine = _linearised(problem)
     found = breaches(engine)
+    if not found:
+        return
     events, _ = events_of(engine, found, [(np.zeros_like(one.levels),) * 2 for one in found])
     if not len(events.nodes) or events.union(engine.response) < _HOPELESS * problem.delta:
         return
@@ -176,7 +178,7 @@ def _pushed(problem: Problem, engine: Linearisation, found: list[Breach]) -> Ite
         yield best
 
 
-def _at(problem: Problem, time: float, which: int) -> Iterator[_Attempt]:
+def _at(problem: Problem, time: float, which: tuple[int, int]) -> Iterator[_Attempt]:
     """What is promised with pushes until a time, the best first."""
     poll("pushes of the noise")
     try:
@@ -215,7 +217,7 @@ def _tried(problem: Problem, engine: Linearisation, cost: float = 0.0) -> list[_
         return []
 
 
-def _nearest(engine: Linearisation, found: list[Breach]) -> tuple[int, float, Callable[[float], float]]:
+def _nearest(engine: Linearisation, found: list[Breach]) -> tuple[tuple[int, int], float, Callable[[float], float]]:
     """The breach that is the fewest standard deviations away at some node, and the first time at which it nearly is.
 
     The third entry says how many that are until a time, at the least.
@@ -234,7 +236,7 @@ def _nearest(engine: Linearisation, found: list[Breach]) -> tuple[int, float, Ca
     def until(time: float) -> float:
         return float(course[max(min(math.ceil(time / engine.step - 1e-9) - offset, len(course) - 1), 0)])
 
-    return best[1], best[2], until
+    return found[best[1]].place, best[2], until
 
 
 def _linearised(problem: Problem) -> Linearisation:

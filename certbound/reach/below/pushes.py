@@ -76,8 +76,8 @@ class Pushed:
             terms = np.where(pushes == 0, 0.0, pushes**2 * self.weight)
         return float(np.sqrt(terms.sum()) * (1 + 1e-11))
 
-    def steered(self, which: int, margin: float) -> tuple[Array, float] | None:
-        """The least pushes, nearly, that lead the nominal beyond the breach number ``which`` at the end of the horizon.
+    def steered(self, which: tuple[int, int], margin: float) -> tuple[Array, float] | None:
+        """The least pushes, nearly, that lead the nominal beyond the breach at a place at the end of the horizon.
 
         By ``margin`` standard deviations of what decides there. Proposes: None where it does not get there.
         """
@@ -87,7 +87,10 @@ class Pushed:
             engine = Linearisation(self.under(pushes), pieces=self.count if self.continuous else None)
             if engine.lost:
                 return None
-            row, missing, size = _missing(engine, breaches(engine)[which], margin)
+            breach = next((one for one in breaches(engine) if one.place == which), None)
+            if breach is None:  # no time of this grid lies in its window
+                return None
+            row, missing, size = _missing(engine, breach, margin)
             slopes = self._slopes(engine, row)
             free = np.where(np.isfinite(self.weight), 1 / self.weight, 0.0)
             scale = float((slopes**2 * free).sum())

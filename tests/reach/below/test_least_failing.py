@@ -153,3 +153,15 @@ def test_noise_that_follows_the_state_or_is_not_normal_has_none():
     assert least_failing(cb.Problem(system, initial=[0], safe=safe, horizon=1, delta=0.01)) is None
     steps = cb.DiscreteSystem(lambda x: x, states=["x"], noise=cb.Uniform(halfwidth=1.0))
     assert least_failing(cb.Problem(steps, initial=[0], safe=safe, horizon=5, delta=0.01)) is None
+
+
+NARROW = cb.Inside(cb.Box([-3.0, -np.inf], [3.0, np.inf]), during=(0.4999, 0.5001))
+HALF = cb.Inside(cb.Box([-np.inf], [0.5], coordinates=[0]))
+
+
+def test_windows_between_the_times_of_a_grid_hide_nothing():
+    both = least_failing(curved([NARROW, HALF], horizon=1.0))
+    assert both.label == "th <= 0.5"
+    assert both.probability > 0.02
+    never = cb.Inside(cb.Box([-0.3, -np.inf], [0.3, np.inf]), during=(0.4997, 0.49971))
+    assert least_failing(curved([never], horizon=1.0)) is None
