@@ -13,6 +13,7 @@ from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, through
 from certbound.values.semilagrangian.confines import TWICE
 from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import Setting
+from certbound.values.semilagrangian.obstacles import Catch
 from certbound.values.semilagrangian.smoothing import Lines
 
 
@@ -37,6 +38,8 @@ class Bounds:
         Whether this is about -L.
     paid : ndarray, shape (ny - 1, nq - 1), or 0
         What every cell pays besides in a step.
+    catches : sequence of Catch
+        What cells are paid (-L).
     """
 
     level: Array
@@ -46,6 +49,7 @@ class Bounds:
     mirrors: Sequence[Mirror] = ()
     below: bool = False
     paid: Array | float = 0.0
+    catches: Sequence[Catch] = ()
 
 
 def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines:
@@ -64,7 +68,11 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
         bend[nodes] = np.maximum(bend[nodes], curve)
         payment[band.first : band.last] = paid
     bend = np.where(np.isfinite(bend), bend, 0.0)
-    return limited(frame, bounds, nodal + around_nodes(payment + bounds.paid, largest=True), bend)
+    payment = payment + bounds.paid
+    owed = [catch.owed(value.nodal, value.bend, np.diff(frame.q)) for catch in bounds.catches]
+    if owed:
+        payment = payment - np.maximum.reduce(owed)
+    return limited(frame, bounds, nodal + around_nodes(payment, largest=True), bend)
 
 
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:
@@ -166,11 +174,13 @@ def levels_above(safe: Mask, crossed: Mask) -> Array:
     return np.where(beyond > 0, TWICE, np.where(outside > 0, 1.0, 0.0))
 
 
-def bounds_below(live: Mask, broken: Mask, reach: tuple[int, int], mirrors: Sequence[Mirror]) -> Bounds:
+def bounds_below(
+    live: Mask, broken: Mask, reach: tuple[int, int], mirrors: Sequence[Mirror], catches: Sequence[Catch]
+) -> Bounds:
     """What -L must be at least: -1 where all around is surely broken or stepped, 0 where nothing is known."""
     unknown = around_nodes((~live & ~broken).astype(float), largest=True) > 0
     stepped = around_nodes(live.astype(float), largest=True) > 0
     return Bounds(
         level=np.where(unknown, 0.0, -1.0), fixed=unknown, free=~unknown & ~stepped, reach=reach, mirrors=mirrors,
-        below=True,
+        below=True, catches=catches,
     )  # fmt: skip

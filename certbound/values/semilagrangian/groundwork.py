@@ -29,7 +29,7 @@ from certbound.values.semilagrangian.local_steps import (
 )
 from certbound.values.semilagrangian.mirrors import mirrors_of
 from certbound.values.semilagrangian.noisy_axis import Setting
-from certbound.values.semilagrangian.obstacles import Way, tolls_of, ways_past
+from certbound.values.semilagrangian.obstacles import Way, catches_of, tolls_of, ways_past
 from certbound.values.semilagrangian.remainders import bowed, level_of
 from certbound.watch import poll
 
@@ -77,11 +77,12 @@ def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Lay
     above, below, beyond = mirrors_of(setting, clock, axes, blocks, usable)
     level = np.maximum(levels_above(marked.safe & live, marked.crossed), beyond)
     everywhere = np.ones(level.shape, dtype=bool)
-    paid = marked.bent + tolls_of(setting, clock, frame, blocks, (_starts(index[0]), _starts(index[1])), marked.ways)
+    known = setting, clock, frame, blocks, (_starts(index[0]), _starts(index[1])), marked.ways
+    paid = marked.bent + tolls_of(*known)
     return Layout(
         clock=clock, frame=frame, bands=bands,
         above=Bounds(level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above, paid=paid),
-        below=bounds_below(live, marked.broken, reach, below),
+        below=bounds_below(live, marked.broken, reach, below, catches_of(*known)),
     )  # fmt: skip
 
 

@@ -22,12 +22,13 @@ def test_one_step_counts_who_meets_an_obstacle_and_ends_beside_it() -> None:
     """p falls, q is driven up: past the right upper corner of a box, in below it and out above it in one step."""
     s, count, parts = 0.1, 3000, 60
     system = cb.ContinuousSystem(lambda x: [x[1], 0.7 - 0.5 * x[0] - x[1] - 0.75], states=2, diffusion=[[0.0], [s]])
-    safe = [cb.Outside(cb.Box([-0.6, -1.2], [0.0, -0.75])), cb.Inside(cb.Box([-0.4, -1.05], [0.2, -0.5]))]
+    safe = [cb.Outside(cb.Box([-0.6, -1.2], [0.0, -0.75])), cb.Inside(cb.Box([-0.4, -1.15], [0.2, -0.35]))]
     setting = setting_of(cb.Problem(system, initial=[0.1, -0.6], safe=safe, horizon=0.1))
     layout = layout_of(setting, Plan(count=1, fine=3.0, wide=0.05, cell=0.35, spare=1e-6))
     value = back(layout.frame, layout.bands, layout.above, leaving.terminal(layout, layout.above))
+    under = back(layout.frame, layout.bands, layout.below, leaving.terminal(layout, layout.below))
     y, q, h, rng = layout.frame.y, layout.frame.q, layout.clock.step, np.random.default_rng(3)
-    ratios = []
+    ratios, caught = [], []
     for p, height in ((0.05, -0.02), (0.05, -0.05), (0.02, 0.01), (0.03, 0.0), (-0.2, 0.02)):
         x, v, met = np.full(count, p), np.full(count, height - 0.75), np.zeros(count, dtype=bool)
         for _ in range(parts):
@@ -39,12 +40,19 @@ def test_one_step_counts_who_meets_an_obstacle_and_ends_beside_it() -> None:
         i, j = np.searchsorted(y, place) - 1, np.searchsorted(q, height - 0.75 + 1e-12, side="right") - 1
         share, part = (place - y[i]) / (y[i + 1] - y[i]), (height - 0.75 - q[j]) / (q[j + 1] - q[j])
         weights = np.outer([1 - share, share], [1 - part, part])
-        arch = value.bend[i : i + 2, j] @ [1 - share, share] * (q[j + 1] - q[j]) ** 2 * part * (1 - part) / 2
-        found = float((weights * value.nodal[i : i + 2, j : j + 2]).sum() + arch)
+        bow = (q[j + 1] - q[j]) ** 2 * part * (1 - part) / 2
+        found, least = (
+            float((weights * one.nodal[i : i + 2, j : j + 2]).sum() + one.bend[i : i + 2, j] @ [1 - share, share] * bow)
+            for one in (value, under)
+        )
+        assert -least - 4 * math.sqrt(seen * (1 - seen) / count) <= seen
         assert found >= seen - 4 * math.sqrt(seen * (1 - seen) / count)
         ratios.append(found / seen)
+        caught.append(max(catch.chance[0, i, j] for catch in layout.below.catches))
+        assert caught[-1] <= seen + 4 * math.sqrt(seen * (1 - seen) / count)
     assert max(ratios) < 4  # 2 is what walls of other shapes count at least, all around
     assert np.median(ratios) < 2.5
+    assert max(caught) > 0.05
 
 
 @pytest.mark.parametrize(("push", "pull"), [(0.7, 0.0), (0.7, 1.5), (-0.3, 0.4), (0.5, -2.0)])
@@ -79,8 +87,9 @@ def test_who_may_come_in_time_counts_although_most_do_not() -> None:
     low, step = point - 1.0, 0.1
     free = Interval.point(np.full(1, -1.0)), Interval.point(np.array(0.01 * step)), 0.1, step
     far, near = (
-        passed(found, 0, low, (point + away, point - 5), Interval.point(point - 1.0), *free)[0] for away in (0.12, 0.09)
+        passed(found, 0, low, point, (point + away, point - 5), Interval.point(point - 1.0), *free)[0]
+        for away in (0.12, 0.09)
     )
     assert 1e-300 < far < 1e-3  # .12 away at the speed 1: nearly none, but not none
     assert near < 1e-8  # who comes there ends within
-    assert passed(found, 0, low, (point + 0.2, point - 5), Interval.point(point - 1.0), *free)[0] < 1e-290
+    assert passed(found, 0, low, point, (point + 0.2, point - 5), Interval.point(point - 1.0), *free)[0] < 1e-290

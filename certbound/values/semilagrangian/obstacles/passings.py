@@ -14,6 +14,9 @@ room.
 at least that on the tube. Y_t is normal. From y > 0 on, Y meets 0 with a probability of at most c(y) (`meeting`), which
 falls: its mean is at most the sum of c's falls at y_1 < y_2 < ... times P(Y_t < y_i), with c = 1 up to 0.
 
+The drift at the end is that for the start's p, and changes at a rate within ``turn``: where that gives a larger mean of
+Y, it is taken (`least_mean`).
+
 *The time t* (`_arrival`): |F| bounds it. Where F <= 0 all along and F_q is a constant a, dF >= c dt + a s dW, so that
 p_u >= p_0 + F_0 u + c u^2/2 - |a| s |int W|, and int W up to u is normal with variance u^3/3. As p only falls, p_t > p1
 tells that p was above p1 before: true but for a share Phi(-w) of the paths, if t is the first root of
@@ -39,7 +42,7 @@ from certbound.values.semilagrangian.confines import Ends
 _UP = 1 + 1e-9
 _FALLS = np.concatenate([0.92 ** np.arange(1, 40), 0.035 * 0.7 ** np.arange(1, 40), 2e-8 * 0.3 ** np.arange(1, 50)])
 _PIECES = 800
-_WIDE = (3.3, 4.4, 6.0, math.inf)
+_WIDE = (2.7, 3.3, 4.4, 6.0, math.inf)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -52,12 +55,18 @@ class Passing:
         Z = sign (q - end), between -depth and 0 in the obstacle.
     push, pull : ndarray
         Z' >= push - pull Z.
+    rest : ndarray
+        Z' is the drift at the end less pull Z, but for so much.
+    turn : Interval
+        How fast the drift of q at the end changes, along Z.
     top : ndarray
         Z <= top.
     speeds : (ndarray, ndarray)
         How fast p falls and rises at most.
     turns : (ndarray, ndarray)
         c of the module where p only falls, and where it only rises; nan where that does not serve.
+    slow, slowed : (ndarray, ndarray)
+        For lower bounds: how fast p falls and rises at least, and what is at least c there.
     slope : ndarray
         |F_q|.
     stays, known : ndarray of bool
@@ -69,9 +78,13 @@ class Passing:
     depth: float
     push: Array
     pull: Array
+    rest: Array
+    turn: Interval
     top: Array
     speeds: tuple[Array, Array]
     turns: tuple[Array, Array]
+    slow: tuple[Array, Array]
+    slowed: tuple[Array, Array]
     slope: Array
     stays: Mask
     known: Mask
@@ -109,21 +122,27 @@ def passing(
     at, worst, _ = evaluate(tape, [zero, p, Interval.point(np.full(len(p), end))])
     known = ~bad & ~worse & ~worst & ~jumps & np.isfinite(np.hstack([f.mag, at.mag, slopes.mag])).all(axis=1)
     reach = np.maximum(np.abs(q.lo - end), np.abs(q.hi - end))
-    push = (at[:, 1] * sign).lo - slopes[:, 3].rad * reach * _UP
+    rest = slopes[:, 3].rad * reach * _UP
+    push, turn = (at[:, 1] * sign).lo - rest, slopes[:, 2] * f[:, 0] * sign
     return Passing(
         sign=sign, end=end, depth=q1 - q0, push=np.where(known, push - 1e-12 * (1 + np.abs(push)), 0.0),
-        pull=np.where(known, -slopes[:, 3].mid, 0.0),
+        pull=np.where(known, -slopes[:, 3].mid, 0.0), rest=np.where(known, rest, 0.0),
+        turn=Interval(np.where(known, turn.lo, 0.0), np.where(known, turn.hi, 0.0)),
         top=np.where(known, (q.hi - end if side else end - q.lo) * _UP, 1.0),
         speeds=(np.maximum(-f.lo[:, 0], 0.0) * _UP, np.maximum(f.hi[:, 0], 0.0) * _UP),
         turns=(
             np.where(even & known & falls, drift.lo, np.nan), np.where(even & known & rises, -drift.hi, np.nan)
+        ),
+        slow=(np.maximum(-f.hi[:, 0], 0.0), np.maximum(f.lo[:, 0], 0.0)),
+        slowed=(
+            np.where(even & known & falls, drift.hi, np.nan), np.where(even & known & rises, -drift.lo, np.nan)
         ),
         slope=slopes[:, 1].mag, stays=((p.lo >= p0) | rises) & ((p.hi <= p1) | falls) & known, known=known,
     )  # fmt: skip
 
 
 def passed(
-    found: Passing, k: int, low: Array, away: tuple[Array, Array], rates: Interval, ends: Interval,
+    found: Passing, k: int, low: Array, drift: Array, away: tuple[Array, Array], rates: Interval, ends: Interval,
     variance: Interval, s: float, step: float,
 ) -> Array:  # fmt: skip
     """Upper bounds of the probability that a path meets the obstacle within the step and ends outside of it.
@@ -135,6 +154,8 @@ def passed(
         The box of starts.
     low : ndarray, shape (N,)
         The least Z of the starts.
+    drift : ndarray, shape (N,)
+        Least drift of Z at the end of the obstacle, for p of the starts.
     away : two ndarrays, shape (N,)
         Least distances of p from the obstacle where it is above its upper (below its lower) end, else at most 0.
     rates : Interval, shape (N,)
@@ -151,18 +172,27 @@ def passed(
     within = beyond = np.zeros(len(low))
     if found.stays[k]:
         within, beyond = -ends.hi, -(found.depth + ends.lo)
-        within = _at_most(within / np.sqrt(np.where(within < 0, variance.lo, variance.hi))) * (1 - 4e-9)
-        beyond = _at_most(beyond / np.sqrt(np.where(beyond > 0, variance.lo, variance.hi)))
+        within = at_most(within / np.sqrt(np.where(within < 0, variance.lo, variance.hi))) * (1 - 4e-9)
+        beyond = at_most(beyond / np.sqrt(np.where(beyond > 0, variance.lo, variance.hi)))
     for wide in _WIDE if np.isfinite([turn[k] for turn in found.turns]).any() else _WIDE[-1:]:
         late = _arrival(found, k, away, rates, s, step, wide)
         t = np.minimum(late, step)
-        mean = low * np.exp(-pull * t) + push * _whole(pull, t)
+        mean = np.maximum(low * np.exp(-pull * t) + push * whole(pull, t), least_mean(found, k, low, drift, t))
         mean -= 1e-12 * (np.abs(low) + abs(push) * step)
-        root = np.maximum(s * np.sqrt(_whole(2 * pull, t)), 1e-300)
-        met = (_at_most((y - mean[:, None]) / root[:, None]) @ falls + chance[-1]) * _UP
+        root = np.maximum(s * np.sqrt(whole(2 * pull, t)), 1e-300)
+        met = (at_most((y - mean[:, None]) / root[:, None]) @ falls + chance[-1]) * _UP
         met = np.where(late > step, 0.0, np.maximum(met - within, 0.0) + beyond)
-        best = np.minimum(best, met + float(_at_most(np.array(-wide))))
+        best = np.minimum(best, met + float(at_most(np.array(-wide))))
     return best
+
+
+def least_mean(found: Passing, k: int, low: Array, drift: Array, t: Array) -> Array:
+    """Lower bounds of E Y_t for dY = (drift - rest + turn u - pull Y) du + s dW from ``low`` on."""
+    pull, rate = float(found.pull[k]), float(found.turn.lo[k])
+    shares = np.exp(-pull * t), np.ones(np.shape(t))  # int u e^{-pull (t - u)} lies between both times t^2/2
+    change = np.minimum(rate * shares[0], rate * shares[1]) * t**2 / 2
+    mean = low * shares[0] + (drift - float(found.rest[k])) * whole(pull, t) + change
+    return np.asarray(mean - 1e-12 * (np.abs(low) + np.abs(drift) * t + np.abs(change)))
 
 
 def meeting(push: float, pull: float, top: float, s: float, step: float) -> tuple[Array, Array]:
@@ -185,8 +215,8 @@ def meeting(push: float, pull: float, top: float, s: float, step: float) -> tupl
     scale = np.where(np.isfinite(scale), scale, 1.0)
     least, root = min(push, push - pull * top), s * math.sqrt(step)
     tilt = -2 * least * y / s**2
-    tilt = np.where(tilt < 600, np.exp(np.minimum(tilt, 600.0)) * _at_most((least * step - y) / root), 1.0)
-    found = np.minimum(np.minimum(scale, _at_most(-(y + least * step) / root) + tilt), 1.0) * _UP
+    tilt = np.where(tilt < 600, np.exp(np.minimum(tilt, 600.0)) * at_most((least * step - y) / root), 1.0)
+    found = np.minimum(np.minimum(scale, at_most(-(y + least * step) / root) + tilt), 1.0) * _UP
     found = np.minimum.accumulate(np.append(found[:-1], 0.0))
     chosen = np.unique(np.minimum(np.searchsorted(-found, -_FALLS), _PIECES))
     chosen = np.append(chosen[(chosen > 0) & (chosen < _PIECES)], _PIECES)
@@ -216,12 +246,12 @@ def _root(away: Array, speed: Array, turn: float) -> Array:
     return np.where(rest < 0, np.inf, 2 * away / np.maximum(speed + np.sqrt(np.maximum(rest, 0.0)) * _UP, 1e-300))
 
 
-def _at_most(z: Array) -> Array:
+def at_most(z: Array) -> Array:
     """Upper bounds of P(N(0, 1) <= z)."""
     flat = (np.asarray(z, dtype=float) / -math.sqrt(2)).ravel().tolist()
     return np.array([math.erfc(value) for value in flat]).reshape(np.shape(z)) * (0.5 * _UP) + 1e-300
 
 
-def _whole(rate: float, t: Array) -> Array:
+def whole(rate: float, t: Array) -> Array:
     """The integral of e^{-rate u} over [0, t]."""
     return t if rate == 0 else np.asarray(-np.expm1(-rate * t) / rate)

@@ -1,4 +1,9 @@
-"""What the grid's cells pay for paths that meet an obstacle along the coordinates within a step and end beside it."""
+"""What the grid's cells pay for paths that meet an obstacle along the coordinates within a step and end beside it.
+
+From below they are paid: of who meets it and ends at a height Z_h > z_k above it L counts at most M_k, the most in all
+places of such ends, and u counts 1. With M_0 = 1 and M_k falling, sum_k (M_{k-1} - M_k) 1{Z_h > z_k} <= 1 - L there, so
+that u >= E L + sum_k (M_{k-1} - M_k) P(meets it, Z_h > z_k).
+"""
 
 from __future__ import annotations
 
@@ -15,6 +20,7 @@ from certbound.values.semilagrangian.bands import Frame
 from certbound.values.semilagrangian.confines import Ends, Wall
 from certbound.values.semilagrangian.local_steps import Blocks, Clock
 from certbound.values.semilagrangian.noisy_axis import Setting
+from certbound.values.semilagrangian.obstacles.catches import caught
 from certbound.values.semilagrangian.obstacles.passings import Passing, passed, passing
 
 
@@ -29,6 +35,89 @@ class Way:
     found: Passing
     place: Index
     paid: Mask
+
+
+_ABOVE = np.array([0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Catch:
+    """Who is caught within a step and ends beside an obstacle, at one of its ends along q.
+
+    ``chance`` has lower bounds for K heights, shape (K, ny - 1, nq - 1), and ``places`` the cells in which who ends
+    above them may be.
+    """
+
+    chance: Array
+    places: Mask
+
+    def owed(self, nodal: Array, bend: Array, dq: Array) -> Array:
+        """What -L may be lowered by, shape (ny - 1, nq - 1); ``nodal`` and ``bend`` are those of -L."""
+        most = -over_corners(np.minimum, nodal)
+        most += np.maximum(-np.minimum(bend[1:], bend[:-1]), 0.0) * dq**2 / 8 * (1 + 1e-9) + 1e-12
+        total, before = np.zeros(most.shape), 1.0
+        for chance, places in zip(self.chance, self.places):
+            now = min(before, max(float(np.max(most[places], initial=0.0)), 0.0))
+            total += (before - now) * chance
+            before = now
+        return total * (1 - 1e-9)
+
+
+def catches_of(
+    setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
+) -> list[Catch]:
+    """What cells are paid from below, obstacle by obstacle and end by end; as `tolls_of`."""
+    s, (p_tube, q_tube) = setting.noise * (1 + setting.spread), blocks.strays.tube
+    above, faces, catches = _ABOVE * setting.noise * math.sqrt(clock.step), setting.faces[1], []
+    y, q = Interval(frame.y[:-1], frame.y[1:]), Interval(frame.q[:-1], frame.q[1:])
+    for way in (way for ways in every for way in ways):
+        kept = way.paid & (q_tube.lo > faces[0]) & (q_tube.hi < faces[1])
+        kept[kept] = way.found.stays[way.place[kept]]
+        if not kept.any():
+            continue
+        chance = np.zeros((len(above), *frame.live.shape))
+        for i, j in np.argwhere(kept):
+            rows, columns = _cells(frame, starts, i, j)
+            if not len(rows):
+                continue
+            p, here, rates = _starts_in(setting, clock, frame, rows, columns)
+            far = np.nextafter(p.hi - way.ends[1], np.inf), np.nextafter(way.ends[0] - p.lo, np.inf)
+            chance[:, rows, columns] = caught(
+                way.found, int(way.place[i, j]), (here - way.found.end) * way.found.sign,
+                _drift(setting, way.found, p), far, rates, above, s, clock.step, clock.omega,
+            )  # fmt: skip
+        tall = float(q_tube.lo[kept].min()), float(q_tube.hi[kept].max())
+        ends = max(float(p_tube.lo[kept].min()), way.ends[0]), min(float(p_tube.hi[kept].max()), way.ends[1])
+        slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
+        if frame.y[0] + slant[1] > ends[0] or frame.y[-1] + slant[0] < ends[1]:
+            continue
+        p = y[:, None] + (q * clock.shear)[None]
+        high = ((q - way.found.end) * way.found.sign).hi
+        near = (p.hi >= ends[0]) & (p.lo <= ends[1]) & (q.hi >= tall[0]) & (q.lo <= tall[1])
+        catches.append(Catch(chance=chance, places=near & (high >= above[:, None])[:, None]))
+    return catches
+
+
+def _cells(frame: Frame, starts: tuple[Index, Index], i: int, j: int) -> tuple[Index, Index]:
+    """Live cells of a block."""
+    rows, columns = np.nonzero(frame.live[starts[0][i] : starts[0][i + 1], starts[1][j] : starts[1][j + 1]])
+    return rows + starts[0][i], columns + starts[1][j]
+
+
+def _starts_in(
+    setting: Setting, clock: Clock, frame: Frame, rows: Index, columns: Index
+) -> tuple[Interval, Interval, Interval]:
+    """p, q and F on cells."""
+    q = Interval(frame.q[columns], frame.q[columns + 1])
+    p = Interval(frame.y[rows], frame.y[rows + 1]) + q * clock.shear
+    f, bad, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(rows))), p, q])
+    return p, q, Interval(np.where(bad, -np.inf, f.lo[:, 0]), np.where(bad, np.inf, f.hi[:, 0]))
+
+
+def _drift(setting: Setting, found: Passing, p: Interval) -> Interval:
+    """Of Z at the obstacle's end, for these p."""
+    at, _, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(p))), p, Interval.point(np.full(len(p), found.end))])
+    return at[:, 1] * found.sign
 
 
 def ways_past(
@@ -66,15 +155,10 @@ def tolls_of(
     high = over_corners(np.maximum, frame.image[1] + frame.radius[1]) + bent
     for ways in every:
         for i, j in np.argwhere(np.any([way.paid for way in ways], axis=0)) if ways else ():
-            part = slice(starts[0][i], starts[0][i + 1]), slice(starts[1][j], starts[1][j + 1])
-            rows, columns = np.nonzero(frame.live[part])
+            rows, columns = _cells(frame, starts, i, j)
             if not len(rows):
                 continue
-            rows, columns = rows + part[0].start, columns + part[1].start
-            q = Interval(frame.q[columns], frame.q[columns + 1])
-            p = Interval(frame.y[rows], frame.y[rows + 1]) + q * clock.shear
-            f, bad, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(rows))), p, q])
-            rates = Interval(np.where(bad, -np.inf, f.lo[:, 0]), np.where(bad, np.inf, f.hi[:, 0]))
+            p, q, rates = _starts_in(setting, clock, frame, rows, columns)
             most = float(blocks.strays.most[1][i, j])
             image = Interval(low[rows, columns] - most, high[rows, columns] + most)
             due = np.ones(len(rows))
@@ -84,7 +168,8 @@ def tolls_of(
                 if way.paid[i, j]:
                     sign, end = way.found.sign, way.found.end
                     due = np.minimum(due, passed(
-                        way.found, int(way.place[i, j]), ((q - end) * sign).lo, away, rates, (image - end) * sign,
+                        way.found, int(way.place[i, j]), ((q - end) * sign).lo,
+                        _drift(setting, way.found, p).lo, away, rates, (image - end) * sign,
                         blocks.covariance[2][i, j], s, clock.step,
                     ))  # fmt: skip
             total[rows, columns] += due
