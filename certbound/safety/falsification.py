@@ -1,20 +1,25 @@
 """Noise-free trajectories that provably leave the safe set.
 
 Sampled trajectories propose a start, a constant disturbance and a time; the trajectory is then enclosed (Thm K5 with
-local rates, from the start alone), and the violation is proved for every point of the enclosure.
+local rates, from the start alone), and the violation is proved for every point of the enclosure. A few noisy paths
+beside them say what is likely where nothing is proved.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import CertboundError
-from certbound.problem.model import compile_numpy, edged, varying_outputs
+from certbound.problem.model import Tape, compile_numpy, edged, varying_outputs
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Outside, clearance
+from certbound.problem.systems import DiscreteSystem
 from certbound.reach.nominal import Flow
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
@@ -23,6 +28,7 @@ from certbound.watch import poll
 PATHS = 64
 STEPS = 400
 ATTEMPTS = 3
+_MOST_STEPS = 1000
 _WHOLE = 4_000_000  # numbers of all paths up to which affine dynamics are followed at once
 
 
@@ -64,6 +70,59 @@ def find_violation(problem: Problem) -> Violation | None:
         if violation is not None:
             return violation
     return None
+
+
+def rough_failures(problem: Problem, *, paths: int = 500, seconds: float = 0.25) -> int | None:
+    """How many of so many noisy paths break a constraint, in floats; None where that is not known at once.
+
+    Proves nothing: fixed steps, looked at when they end, from random starts under random constant disturbances. None,
+    too, where the problem has a target, an end, held inputs, unknown constants or noise without a law; where steps are
+    too long for the model; and where it took more than ``seconds`` of processor time.
+    """
+    if problem.endless or problem.ending or problem.reach is not None or problem.hold is not None or problem.unknown:
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            return _failed(Flow(problem), paths, time.process_time() + seconds)
+    except (CertboundError, ValueError):  # random constants, a start that cannot be drawn, noise without a law
+        return None
+
+
+def _failed(flow: Flow, count: int, until: float) -> int | None:
+    rng, system = np.random.default_rng(0), flow.problem.system
+    discrete = isinstance(system, DiscreteSystem)
+    if isinstance(system, DiscreteSystem):
+        steps, gain = int(flow.horizon), system.noise_matrix if system.gain is None else system.gain
+        draw = partial(system.noise.sample, rng, count)
+    else:
+        steps, gain = STEPS, system.diffusion
+        draw = partial(rng.standard_normal, (count, gain.shape[1]))
+    x, box = np.asarray(flow.problem.initial.sample(rng, count)), flow.disturbance
+    signals = rng.uniform(box.lo, box.hi, (count, box.shape[0]))
+    if not discrete:
+        row = flow.plan_rows([0.0])[0]
+        slopes = compile_numpy(flow.state_jacobian)(0.0, *x.T, *row, *signals.T)
+        steps = max(steps, int(np.ceil(flow.horizon * np.linalg.norm(slopes, axis=(-2, -1)).max())))
+    if steps > _MOST_STEPS or count * steps * flow.dimension > 4 * _WHOLE:
+        return None
+    times, step = np.linspace(0.0, flow.horizon, steps + 1), flow.horizon / steps
+    spread = compile_numpy(gain) if isinstance(gain, Tape) else None
+    rows, drift, pushed = flow.plan_rows(times[:-1] + 0.25 * step * (not discrete)), compile_numpy(flow.tape), signals.T
+    found = np.empty((count, steps + 1, flow.dimension))
+    found[:, 0] = x
+    for k, t in enumerate(times[:-1]):
+        if time.process_time() > until:
+            return None
+        noise = draw() * (1.0 if discrete else step**0.5)
+        g = np.asarray(gain if spread is None else spread(t, *x.T))
+        kick = noise @ g.T if g.ndim == 2 else np.einsum("pij,pj->pi", g, noise)
+        row = rows[k]
+        x = kick + (drift(t, *x.T, *row, *pushed) if discrete else _advanced(drift, t, step, x, row, pushed))
+        found[:, k + 1] = x
+    broken = np.zeros(count, dtype=bool)
+    for constraint in flow.problem.kept:
+        broken |= rooms(constraint, flow, times, found).min(axis=1) < 0
+    return int(broken.sum()) if np.all(np.isfinite(x).all(axis=1) | broken) else None
 
 
 def rooms(constraint: Inside, flow: Flow, times: Array, paths: Array) -> Array:
@@ -110,16 +169,18 @@ def follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
         for k in range(steps):
             poll()
             t, h, row = float(times[k]), float(times[k + 1] - times[k]), rows[k]
-            k1 = function(t, *x.T, *row, *pushed)
-            if flow.continuous:
-                k2 = function(t + h / 2, *(x + h / 2 * k1).T, *row, *pushed)
-                k3 = function(t + h / 2, *(x + h / 2 * k2).T, *row, *pushed)
-                k4 = function(t + h, *(x + h * k3).T, *row, *pushed)
-                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            else:
-                x = k1
+            x = _advanced(function, t, h, x, row, pushed) if flow.continuous else function(t, *x.T, *row, *pushed)
             paths[:, k + 1] = x
     return times, paths
+
+
+def _advanced(function: Callable[..., Array], t: float, h: float, x: Array, row: Array, pushed: Array) -> Array:
+    """One step of the classical method of order four."""
+    k1 = function(t, *x.T, *row, *pushed)
+    k2 = function(t + h / 2, *(x + h / 2 * k1).T, *row, *pushed)
+    k3 = function(t + h / 2, *(x + h / 2 * k2).T, *row, *pushed)
+    k4 = function(t + h, *(x + h * k3).T, *row, *pushed)
+    return np.asarray(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
 
 
 def _affine(flow: Flow, times: Array, rows: Array, signals: Array) -> tuple[Array, Array]:

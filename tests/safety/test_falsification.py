@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import certbound as cb
 from certbound.problem.noise import Gaussian
 from certbound.problem.problem import Problem
 from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
@@ -12,7 +13,7 @@ from certbound.problem.sets.regions import Ball, Box, HalfSpace
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.reach.nominal.flow import Flow
 from certbound.safety import falsification
-from certbound.safety.falsification import find_violation
+from certbound.safety.falsification import find_violation, rough_failures
 
 
 def drift(safe, horizon=2.0, initial=(0.0, 0.0), d=0.0, domain=None) -> Problem:
@@ -135,3 +136,31 @@ def test_what_jumps_is_not_followed_as_affine() -> None:
     flow = Flow(Problem(system, initial=[3.0], safe=[Inside(Box([-9.0], [9.0]))], horizon=2))
     paths = falsification.follow(flow, np.array([[3.0]]), np.zeros((1, 0)))[1]
     assert paths[0, :, 0] == pytest.approx([3.0, 2.5, 2.25])
+
+
+def test_a_few_paths_say_what_is_likely():
+    steps = cb.DiscreteSystem(lambda x: x, states=["x"], noise=cb.Gaussian(std=1.0))
+    safe = [cb.Inside(cb.Box([-np.inf], [1.5], coordinates=[0]))]
+    once = cb.Problem(steps, initial=[0.0], safe=safe, horizon=1, delta=0.01)
+    assert 400 < rough_failures(once, paths=8000) < 670  # 534
+    moved = once.replace(initial=cb.Box([0.5], [1.5]))
+    assert 2400 < rough_failures(moved, paths=8000) < 2800  # 8000 times the mean of Phi(-1 ... 0), .316
+    late = once.replace(horizon=4, safe=[cb.Inside(safe[0].region, during=(4, 4))])
+    assert 1650 < rough_failures(late, paths=8000) < 1980  # Phi(-.75): 1813
+
+
+def test_steps_of_few_paths_keep_the_energy_of_an_oscillator():
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.0], [0.01]])
+    safe = [cb.Inside(cb.Box([-1.15, -9], [1.15, 9]))]
+    assert rough_failures(cb.Problem(system, initial=[1.0, 0.0], safe=safe, horizon=30.0, delta=0.01)) < 10
+
+
+@pytest.mark.parametrize("cure", [
+    {"reach": cb.Reach(cb.Ball([0.0], 0.1))}, {"domain": cb.Box([-3], [3]), "leaving": "ends"}])
+def test_a_few_paths_say_nothing_of_targets_and_ends(cure):
+    system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=[[1.0]])
+    problem = cb.Problem(system, initial=[0.5], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1.0, delta=0.01)
+    assert rough_failures(problem) > 0
+    assert rough_failures(problem.replace(**cure)) is None
+    stiff = cb.ContinuousSystem(lambda x: -1e5 * x, states=["x"], diffusion=[[1.0]])
+    assert rough_failures(problem.replace(system=stiff)) is None

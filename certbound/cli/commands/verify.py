@@ -52,6 +52,7 @@ EXAMPLES = examples(
 
 DEFAULT_LIMIT = 60.0
 _LEAST = 1e-3
+_SIMULATED = 500
 
 MethodOption = Annotated[
     str,
@@ -112,6 +113,8 @@ def verify(
         result["taken"] = list(notes(problem))
     if not as_json:  # the verdict comes first: it stands, whatever becomes of the rest
         _print(subject, result, verdict.caution)
+        if verdict.status == "UNKNOWN" and not SETTINGS.quiet:
+            _suggest(subject)
     if explain and verdict.status in ("UNKNOWN", "UNSAFE"):
         result["limits"] = _limits(verdict, cells, clock)
         if not as_json and not SETTINGS.quiet:
@@ -127,6 +130,16 @@ def verify(
     _write(subject, verdict, proof, report=report, plot=plot)
     show(result, as_json, lambda: None)
     raise typer.Exit(0 if verdict.status == "SAFE" else 1)
+
+
+def _suggest(problem: Problem) -> None:
+    """What a few simulated paths say where nothing is decided."""
+    from certbound.safety.falsification import rough_failures
+
+    failed = rough_failures(problem, paths=_SIMULATED)
+    if failed is not None:
+        share = f"{failed or 'none'} of {_SIMULATED} roughly simulated paths failed"
+        console().print(f"{share} (this is no proof; `certbound simulate` counts more of them)", markup=False)
 
 
 def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any]:
