@@ -28,7 +28,7 @@ from certbound.errors import CertboundError
 from certbound.gaussian.scalar import log_tail
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box
+from certbound.problem.sets import Box, Quadratic
 from certbound.problem.systems import DiscreteSystem
 from certbound.reach.below.breaches import Breach, breaches, events_of
 from certbound.reach.below.pushes import Pushed, plainly
@@ -45,6 +45,7 @@ _DOUBLINGS, _FINER = 6, 2.0**0.5
 _HOPELESS = 0.3  # of the target: what the linear model says, less than which nothing is tried
 _MOST_STEPS, _MOST_STATES, _MOST_PIECES = 2000, 40, 200
 _COARSER = 4
+_INSIDE = 1 - 1e-9  # of the way to the boundary of the starts
 _ENOUGH = 3.0  # times the target: a bound beyond which nothing better is looked for
 
 
@@ -105,25 +106,62 @@ def least_failing(problem: Problem) -> LeastFailing | None:
     problem = in_pieces(problem)
     if depends_on_state(problem) or hidden_jump(problem) is not None:
         return None
-    best: LeastFailing | None = None
     with np.errstate(all="ignore"):
-        for attempt in _attempts(_single(problem)):
-            found = attempt.proved() if best is None or attempt.promise > 1.1 * best.probability else None
-            if found is not None and (best is None or found.probability > best.probability):
-                best = found
-            if best is not None and best.probability > _ENOUGH * problem.delta:
-                break
+        single = _single(problem, None if problem.initial.random else problem.initial.middle)
+        best = _best(single, None)
+        if best is None or best.probability <= problem.delta:
+            start = _farther(problem, single)
+            best = best if start is None else _best(_single(problem, start), best)
     return best
 
 
-def _single(problem: Problem) -> Problem:
-    """The problem from a single start under a single disturbance."""
-    start, system = problem.initial, problem.system
+def _best(single: Problem, best: LeastFailing | None) -> LeastFailing | None:
+    """The larger one of ``best`` and what is proved from one start."""
+    for attempt in _attempts(single):
+        found = attempt.proved() if best is None or attempt.promise > 1.1 * best.probability else None
+        if found is not None and (best is None or found.probability > best.probability):
+            best = found
+        if best is not None and best.probability > _ENOUGH * single.delta:
+            break
+    return best
+
+
+def _farther(problem: Problem, single: Problem) -> Array | None:
+    """A start on the side from which the nearest constraint is nearer than from the middle; None of a point."""
+    start = problem.initial
+    if start.random or start.is_point:
+        return None
+    engine = _linearised(single)
+    found = breaches(engine)
+    if not found:
+        return None
+    which, last, _ = _nearest(engine, found)
+    node = round(last / engine.step)
+    place = node - int(engine.continuous)
+    sizes = engine.response.covariance[0, node]
+    rows = found[which].rows[:, place]
+    row = rows[int(np.argmax(found[which].levels[:, place] / np.sqrt(np.einsum("ji,ik,jk->j", rows, sizes, rows))))]
+    for k in range(node - 1, -1, -1):
+        row = row @ engine.response.transition[0, k]
+    middle = np.asarray(start.middle)
+    if isinstance(start, Box):
+        offset = np.where(row > 0, start.high, start.low) + start.center_at() - middle
+    elif isinstance(start.form, Quadratic):
+        offset = start.form.radius * start.form.shape @ row / math.sqrt(row @ start.form.shape @ row)
+    else:
+        return None
+    inner = middle + _INSIDE * np.where(row == 0, 0.0, offset)
+    return inner if np.all(np.isfinite(inner)) and start.contains(inner) else None
+
+
+def _single(problem: Problem, point: Array | None) -> Problem:
+    """The problem from a single start, unless that is random, under a single disturbance."""
+    system = problem.system
     if system.disturbance is not None:
         middle = (system.disturbance.low + system.disturbance.high) / 2
         system = copy.copy(system)
         assign(system, disturbance=Box(middle, middle))
-    return problem.replace(system=system) if start.random else problem.replace(system=system, initial=start.middle)
+    return problem.replace(system=system) if point is None else problem.replace(system=system, initial=point)
 
 
 def _attempts(problem: Problem) -> Iterator[_Attempt]:

@@ -94,6 +94,19 @@ def test_pushed_noise_costs_what_neyman_and_pearson_say(z, cost):
     assert plainly(float(norm.sf(z)), cost) <= norm.sf(z + cost)
 
 
+@pytest.mark.parametrize("start", [cb.Box([-0.5, -0.25], [0.5, 0.25]), cb.Ball([0.0, 0.0], 0.5)])
+def test_a_start_on_the_side_of_the_nearest_limit_serves(start):
+    system = cb.DiscreteSystem(lambda x: [x[0] + x[1], x[1]], states=2, noise=cb.Gaussian(std=0.1))
+    safe = [cb.Inside(cb.Box([-np.inf, -np.inf], [0.8, np.inf]), during=(1, 1))]
+    problem = cb.Problem(system, initial=start, safe=safe, horizon=1, delta=0.01)
+    found = least_failing(problem)
+    best = 0.75 if isinstance(start, cb.Box) else 0.5 * math.sqrt(2)
+    assert bool(start.contains(found.start))
+    assert found.start.sum() == pytest.approx(best, rel=1e-6)
+    assert found.probability == pytest.approx(norm.sf((0.8 - best) / 0.1), rel=1e-4)
+    assert least_failing(problem.replace(initial=[0.0, 0.0])) is None
+
+
 BOX = cb.Inside(cb.Box([-0.7, -np.inf], [0.7, np.inf]))
 
 
