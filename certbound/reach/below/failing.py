@@ -139,8 +139,9 @@ def _farther(problem: Problem, single: Problem) -> Array | None:
     node = round(last / engine.step)
     place = node - int(engine.continuous)
     sizes = engine.response.covariance[0, node]
-    rows = found[which].rows[:, place]
-    row = rows[int(np.argmax(found[which].levels[:, place] / np.sqrt(np.einsum("ji,ik,jk->j", rows, sizes, rows))))]
+    near = next(one for one in found if one.place == which)
+    rows = near.rows[:, place]
+    row = rows[int(np.argmax(near.levels[:, place] / np.sqrt(np.einsum("ji,ik,jk->j", rows, sizes, rows))))]
     for k in range(node - 1, -1, -1):
         row = row @ engine.response.transition[0, k]
     middle = np.asarray(start.middle)
