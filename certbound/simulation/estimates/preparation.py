@@ -24,6 +24,7 @@ Starts = Callable[[np.random.Generator, int], Array]
 
 _DEFAULT_STEPS = 1000
 _MOST_STEPS = 64_000  # that are taken unasked
+_ROUGH = 0.25  # of what is allowed of Euler's steps: more makes rare exits too frequent, and the other scheme costs the same
 _LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel
 
 
@@ -131,10 +132,13 @@ def _fine_enough(
     """The scheme and the steps, at most ``most``, that a model's fastest modes need; a warning where these are more."""
     horizon = float(problem.horizon)
     looks = jacobians(model, steps, start)
-    if not len(looks) or step_error(looks, horizon / steps, horizon) <= 1.0:
-        return model, steps
+    error = step_error(looks, horizon / steps, horizon) if len(looks) else 0.0
+    choice = scenario.scheme == "auto" and model.spread is not None
+    if error <= 1.0:
+        better = choice and most > 0 and error > max(_ROUGH, step_error(looks, horizon / steps, horizon, looks[0]))
+        return (exponential(model, looks[0], np.asarray(problem.system.diffusion)) if better else model), steps
     needed, base = steps_needed(looks, steps, horizon), None
-    if scenario.scheme == "auto" and model.spread is not None:
+    if choice:
         fewer = steps_needed(looks, steps, horizon, looks[0])
         needed, base = (fewer, looks[0]) if fewer < needed else (needed, None)
     if steps < needed <= min(most, _MOST_STEPS):
