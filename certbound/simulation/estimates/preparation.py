@@ -24,7 +24,7 @@ Starts = Callable[[np.random.Generator, int], Array]
 
 _DEFAULT_STEPS = 1000
 _MOST_STEPS = 64_000  # that are taken unasked
-_ROUGH = 0.25  # of what is allowed of Euler's steps: more makes rare exits too frequent, and the other scheme costs the same
+_ROUGH = 0.25  # of the error that Euler's steps may have: with more, rare exits are far too frequent
 _LONGEST_NOMINAL = 20_000  # steps; longer paths are advanced by the kernel
 
 
