@@ -46,6 +46,7 @@ _MOST = 20  # states
 _LONGEST = 4000  # operations of a model that is looked through for sums
 _UNLIKE = 5  # the logarithm to the base 2 of states' ratio from which they are asked in other units, too
 _FAR = 12  # and first
+_MORE = 0.05  # log10, of a lower bound
 _HALF = 0.5  # of the time that is left, for logarithms
 
 
@@ -335,7 +336,23 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
             return stated(found)
         plain = prove(problem, replace(asked, before=before.plain.details if before else asked.before))
         if found is not None and useful and not (plain.applicable and plain.log10_delta <= found.log10_delta):
-            return stated(found, plain)
+            return _raised(prove, problem, asked, stated(found, plain), found.log10_lower)
         return plain
 
     return proved
+
+
+def _raised(prove: Prove, problem: Problem, asked: Request, answer: EngineAnswer, hoped: float | None) -> EngineAnswer:
+    """The answer with a lower bound in logarithms where about ``hoped`` is more than it has; no certificate states it.
+
+    What was proved in logarithms has more starts and narrower limits, by a rounding: it is proved again for others.
+    """
+    if hoped is None or (answer.log10_lower is not None and hoped < answer.log10_lower + _MORE):
+        return answer
+    asked.found(answer)
+    with contextlib.suppress(InfeasibleError, EnclosureError):
+        other = logarithmic(problem, below=True)
+        again = None if other is None else prove(other[1], replace(asked, before=None, found=lambda _: None))
+        if again is not None and again.applicable and again.log10_lower is not None:
+            return replace(answer, log10_lower=max(again.log10_lower, answer.log10_lower or again.log10_lower))
+    return answer

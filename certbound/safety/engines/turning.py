@@ -193,10 +193,11 @@ def _constraint(constraint: Inside, inverse: Array, moved: set[int]) -> Inside:
     return type(constraint)(turned, during=constraint.during, label=constraint.label)
 
 
-def logarithmic(problem: Problem) -> tuple[tuple[int, ...], Problem] | None:
+def logarithmic(problem: Problem, *, below: bool = False) -> tuple[tuple[int, ...], Problem] | None:
     """The states that are stated by their logarithms, and the problem stated so; None where there are none.
 
-    Proves: P(failing) is at most the largest probability of failing in the problem that is returned.
+    Proves: P(failing) is at most the largest probability of failing in the problem that is returned; with ``below`` it
+    is at least that, as fewer paths start there and limits are wider.
 
     Raises
     ------
@@ -238,7 +239,8 @@ def logarithmic(problem: Problem) -> tuple[tuple[int, ...], Problem] | None:
             diffusion=replace(given, inputs=("t", *names)) if isinstance(given, Tape) else given, **signals,
         )  # fmt: skip
         return places, problem.replace(
-            system=turned, initial=_start_by(problem, places), safe=[_image(one, places, n) for one in problem.safe],
+            system=turned, initial=_start_by(problem, places, below),
+            safe=[_image(one, places, n, below) for one in problem.safe],
             plan=None if law else problem.plan, cost=None, units=None,
         )  # fmt: skip
     except ValueError as error:
@@ -272,18 +274,22 @@ def _log(value: arb, *, up: bool) -> float:
         return upper(value.log()) if up else lower(value.log())
 
 
-def _start_by(problem: Problem, places: tuple[int, ...]) -> Box:
-    """A box around the starts, rounded outward."""
-    hull = problem.initial.hull()
+def _start_by(problem: Problem, places: tuple[int, ...], below: bool) -> Box:
+    """A box around the starts, rounded outward, or one of starts alone where it is for a bound from ``below``."""
+    hull, start = problem.initial.hull(), problem.initial
     low, high = hull.lo.copy(), hull.hi.copy()
+    if below and not (isinstance(start, Box) and np.array_equal([low, high], [start.low, start.high])):
+        raise InfeasibleError("the starts are no box.")
     for i in places:
         if not low[i] > 0:
             raise InfeasibleError("a start is not positive.")
-        low[i], high[i] = _log(arb(low[i]), up=False), _log(arb(high[i]), up=True)
+        low[i], high[i] = _log(arb(low[i]), up=below), _log(arb(high[i]), up=not below)
+        if low[i] > high[i]:
+            raise InfeasibleError("no logarithm of a start is a floating-point number.")
     return Box(low, high)
 
 
-def _image(constraint: Inside, places: tuple[int, ...], n: int) -> Inside:
+def _image(constraint: Inside, places: tuple[int, ...], n: int, below: bool) -> Inside:
     region: Region = constraint.region
     if not set(places) & set(region.places(n)):
         return constraint
@@ -295,7 +301,7 @@ def _image(constraint: Inside, places: tuple[int, ...], n: int) -> Inside:
             with precision():
                 end = arb(float(bounds[number])) / arb(float(row[i]))
             positive = bool(row[i] > 0)
-            side = _log(end, up=constraint.outside == positive)
+            side = _log(end, up=(constraint.outside == positive) != below)
             rows[number], bounds[number] = 0.0, side if positive else -side
             rows[number, i] = 1.0 if positive else -1.0
     if region.kind == "box":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from statistics import NormalDist
 from typing import Any
 
@@ -19,7 +20,7 @@ from certbound.checker.statement import read_model
 from certbound.checker.statement.by_ito import logarithmic_model
 from certbound.problem.model import Tape, compile_numpy
 from certbound.rigor.balls import precision
-from certbound.safety.answers import AS_IT_IS
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.engines import Logarithmic, by_logarithms, linear_engine
 from certbound.safety.engines.turning import logarithmic
@@ -134,3 +135,40 @@ def test_obstacles_grow_and_limits_shrink() -> None:
     assert other.low[0] <= math.log(2.0)
     assert other.high[0] >= math.log(2.5)
     assert max(abs(other.low[0] - math.log(2.0)), abs(other.high[0] - math.log(2.5))) < 1e-15
+
+
+def test_for_lower_bounds_all_is_rounded_the_other_way() -> None:
+    safe = [cb.Inside(cb.Box([0.5], [3.0])), cb.Outside(cb.Box([2.0], [2.5]))]
+    problem = prices(safe=safe, initial=cb.Box([0.9], [1.1]))
+    above, below = stated(problem), (logarithmic(problem, below=True) or ((), problem))[1]
+    inner, outer = above.initial.hull(), below.initial.hull()
+    with precision():
+        assert arb(float(outer.lo[0])) > arb(0.9).log() > arb(float(inner.lo[0]))
+        assert arb(float(outer.hi[0])) < arb(1.1).log() < arb(float(inner.hi[0]))
+        for k, sign, ends in ((0, 1, (0.5, 3.0)), (1, -1, (2.0, 2.5))):  # limits are wider, obstacles smaller
+            narrow, wide = above.safe[k].region, below.safe[k].region
+            assert sign * (arb(ends[0]).log() - arb(float(wide.low[0]))) > 0 > sign * (
+                arb(ends[0]).log() - arb(float(narrow.low[0]))
+            )
+            assert sign * (arb(float(wide.high[0])) - arb(ends[1]).log()) > 0 > sign * (
+                arb(float(narrow.high[0])) - arb(ends[1]).log()
+            )
+    with pytest.raises(cb.InfeasibleError, match="no logarithm"):
+        logarithmic(prices(initial=[1.1]), below=True)
+    with pytest.raises(cb.InfeasibleError, match="no box"):
+        logarithmic(prices(initial=cb.Ball([1.0], 0.1)), below=True)
+
+
+def test_a_lower_bound_in_logarithms_is_proved_of_fewer_starts() -> None:
+    problem = stocks().replace(initial=cb.Box([0.9, 1.9], [1.1, 2.1]))
+    first = stated(problem)
+
+    def prove(given: cb.Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+        plain, narrow = given is problem, given.initial.hull().lo[0] == first.initial.hull().lo[0]
+        lower = {(True, False): -3.0, (False, True): -1.0, (False, False): -1.5}[plain, narrow and not plain]
+        return EngineAnswer(log10_delta=-0.3 if plain else -0.5, log10_lower=lower, reason="so.", method="values")
+
+    found = by_logarithms(prove, again=True)(problem, replace(AS_IT_IS, thorough=True))
+    assert (found.log10_delta, found.log10_lower) == (-0.5, -1.5)
+    assert isinstance(found.details, Logarithmic)
+    assert found.details.plain.log10_lower == -3.0  # what certificates state
