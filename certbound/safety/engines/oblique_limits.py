@@ -47,7 +47,8 @@ _LONGEST = 4000  # operations of a model that is looked through for sums
 _UNLIKE = 5  # the logarithm to the base 2 of states' ratio from which they are asked in other units, too
 _FAR = 12  # and first
 _MORE = 0.05  # log10, of a lower bound
-_HALF = 0.5  # of the time that is left, for logarithms
+_HALF = 0.5  # of the time that is left, for logarithms, and for limits along the axes
+_PARTS = 64  # of what a shear takes of another state
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,12 +83,17 @@ def in_coordinates(prove: Prove, *, beside: Prove | None = None) -> Prove:
         before = asked.before if isinstance(asked.before, Turned | Apart) else None
         inner = replace(asked, before=before.answer.details if isinstance(before, Turned) else None)
         hasty = asked.quick or asked.first
-        turn = None if beside is not None else in_units(problem, _FAR) or (None if hasty else eased(problem))
+        if beside is not None:
+            turn = straight(problem)
+        else:
+            turn = in_units(problem, _FAR) or (None if hasty else eased(problem))
         first: EngineAnswer | None = None
         if turn is not None:
-            with contextlib.suppress(InfeasibleError, EnclosureError):
+            share = share_of_time(_HALF) if beside is not None else contextlib.nullcontext()
+            with share, contextlib.suppress(InfeasibleError, EnclosureError):
                 first = _asked_in(prove, problem, turn, inner, _UNASKED)
-            if first is not None and first.applicable and is_at_most(first.log10_delta, problem.delta):
+            enough = first is not None and first.applicable and is_at_most(first.log10_delta, problem.delta)
+            if first is not None and (enough or (hasty and beside is not None)):
                 return first
         plain = prove(problem, replace(asked, before=before.plain.details) if before else asked)
         enough = plain.applicable and is_at_most(min(plain.log10_delta, 0.0), problem.delta)
@@ -201,6 +207,38 @@ def axes(problem: Problem) -> Turn | None:
         return turn
     sums = exact_product(np.array([[rate.get(j, 0.0) for j in range(n)] for rate in smooth]), turn[0])
     return _sheared(turn, list(sums), sums, pivots)
+
+
+def straight(problem: Problem) -> Turn | None:
+    """In the plane, coordinates in which all limits are limits of one of them, and noises are hardly correlated.
+
+    None where limits are so already, or never, or noise is not constant.
+    """
+    system = problem.system
+    if system.dimension != 2 or not isinstance(system, ContinuousSystem) or isinstance(system.diffusion, Tape):
+        return None
+    with contextlib.suppress(InfeasibleError):
+        turn = axes(problem)
+        if turn is None or _still_oblique(problem, turn):
+            return None
+        size = turn[0] @ system.diffusion @ system.diffusion.T @ turn[0].T
+        oblique = np.count_nonzero(turn[0], axis=1) > 1
+        if oblique.sum() == 1 and not _asked_along(problem, turn, int(np.argmin(oblique))):
+            k = int(np.argmax(oblique))
+            factor = -size[0, 1] / size[k, k] if size[k, k] > 0 else 0.0
+            shear, back = np.eye(2), np.eye(2)
+            shear[1 - k, k] = round(factor * _PARTS) / _PARTS
+            back[1 - k, k] = -shear[1 - k, k]
+            return exact_product(shear, turn[0]), exact_product(turn[1], back)
+        return turn
+    return None
+
+
+def _asked_along(problem: Problem, turn: Turn, place: int) -> bool:
+    """Whether some limit is one of this state of y."""
+    regions = (one.region for one in problem.constraints)
+    faces = [region.lifted(region.form.normals, 2) for region in regions if isinstance(region.form, Faces)]
+    return any(np.any(exact_product(rows, turn[1])[:, place]) for rows in faces)
 
 
 def turns_of(problem: Problem, *, oblique: bool) -> Iterator[Turn]:

@@ -22,7 +22,7 @@ from certbound.problem.model import Tape, compile_numpy, turned_tape
 from certbound.safety.answers import EngineAnswer, Request, exact
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.engines import Apart, Turned, in_coordinates, linear_engine
-from certbound.safety.engines.oblique_limits import axes, eased, turns_of
+from certbound.safety.engines.oblique_limits import axes, eased, straight, turns_of
 from certbound.safety.engines.turning import exact_product, scales_of, turned_problem
 from certbound.safety.verdict import verdict_of
 from experiments.middle import platoon
@@ -268,3 +268,26 @@ def test_what_is_not_defined_stays_so_where_its_factor_is_zero() -> None:
     with np.errstate(invalid="ignore"):
         assert np.isnan(found(0.0, -1.0, 2.0)[0]) == np.isnan(compile_numpy(tape)(0.0, -1.0, 2.0)[0])
     np.testing.assert_allclose(found(0.0, 1.0, 2.0), [1.0, -1.0])
+
+
+def test_a_plane_behind_one_oblique_line_is_asked_along_it_with_noises_apart() -> None:
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=np.diag([0.4, 0.4]))
+    line = cb.Inside(cb.HalfSpace([1, -1], 1.2))
+    problem = cb.Problem(system, initial=[0.0, 0.0], safe=[line], horizon=0.5, delta=0.05)
+    turn = straight(problem)
+    assert turn is not None
+    np.testing.assert_array_equal(turn[0], [[1, -1], [0.5, 0.5]])
+    np.testing.assert_array_equal(turn[0] @ turn[1], np.eye(2))
+    asked: list[cb.Problem] = []
+
+    def prove(own: cb.Problem, request: Request) -> EngineAnswer:
+        asked.append(own)
+        return EngineAnswer(log10_delta=-1.0 if own is problem else -0.5, applicable=True)
+
+    engine = in_coordinates(prove, beside=prove)
+    hasty = engine(problem, Request(quick=True))
+    assert (hasty.log10_delta, len(asked)) == (-0.5, 1)  # the plain one, which is slow there, is not asked yet
+    assert (engine(problem, Request()).log10_delta, len(asked)) == (-1.0, 3)
+    for other in (cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Inside(cb.HalfSpace([3, 1], 2))):
+        assert straight(problem.replace(safe=[line, other])) is None
+    assert straight(problem.replace(safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))])) is None
