@@ -108,7 +108,8 @@ class _ProblemReader(SetReader):
         if extra or table.diffusion is None:
             raise ValueError(
                 "`noise` must hold `diffusion` alone in continuous time, a matrix with "
-                f"{len(self.states)} rows; got {', '.join(extra) or 'nothing'}."
+                f"{len(self.states)} rows, got {', '.join(extra) or 'nothing'}; write `diffusion = [[...]]`, a row for "
+                "every state and a column for every Brownian motion: laws and `matrix` are of discrete time."
             )
         value = table.diffusion
         if not isinstance(value, list):
