@@ -48,7 +48,7 @@ _UNLIKE = 5  # the logarithm to the base 2 of states' ratio from which they are 
 _FAR = 12  # and first
 _MORE = 0.05  # log10, of a lower bound
 _HALF = 0.5  # of the time that is left, for logarithms, and for limits along the axes
-_PARTS = 64  # of what a shear takes of another state
+_SHARES = (0.0, *(sign * 2.0**k for k in range(-4, 3) for sign in (1, -1)))  # of another state, which a shear takes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -225,11 +225,14 @@ def straight(problem: Problem) -> Turn | None:
         oblique = np.count_nonzero(turn[0], axis=1) > 1
         if oblique.sum() == 1 and not _asked_along(problem, turn, int(np.argmin(oblique))):
             k = int(np.argmax(oblique))
-            factor = -size[0, 1] / size[k, k] if size[k, k] > 0 else 0.0
-            shear, back = np.eye(2), np.eye(2)
-            shear[1 - k, k] = round(factor * _PARTS) / _PARTS
-            back[1 - k, k] = -shear[1 - k, k]
-            return exact_product(shear, turn[0]), exact_product(turn[1], back)
+            hoped = -size[0, 1] / size[k, k] if size[k, k] > 0 else 0.0
+            for factor in sorted(_SHARES, key=lambda share: abs(share - hoped)):
+                shear, back = np.eye(2), np.eye(2)
+                shear[1 - k, k], back[1 - k, k] = factor, -factor
+                with contextlib.suppress(InfeasibleError):
+                    other = exact_product(shear, turn[0]), exact_product(turn[1], back)
+                    exact_product(other[0], system.diffusion)
+                    return other
         return turn
     return None
 
