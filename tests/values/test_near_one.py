@@ -11,6 +11,8 @@ import pytest
 
 import certbound as cb
 from certbound.errors import InfeasibleError
+from certbound.safety.answers import Request
+from certbound.safety.portfolio import ENGINES
 from certbound.values.continuous import exits, straight
 from certbound.values.continuous.curved import bounding
 from certbound.values.continuous.held_faces import check_noise
@@ -157,3 +159,15 @@ def test_where_failing_is_rare_a_share_of_u_is_paid(monkeypatch) -> None:
     monkeypatch.setattr(relative, "value_range", lambda patches: (patches.size, np.full(len(patches.size), 0.5)))
     higher = relative_below(proof)  # where V may be .5, what is missing counts e^.5 times
     assert higher is None or higher < found[0][1] - 1e-3
+
+
+@pytest.mark.slow
+def test_a_grid_as_fine_as_a_first_proposal_hopes_for_is_granted() -> None:
+    """Prey and hunters who are sated: no grid that is granted in 5 s proves anything, one twice as fine does."""
+    system = cb.ContinuousSystem(
+        lambda z: [z[0] * (1 - z[0] / 3) - z[0] * z[1] / (1 + z[0]), 0.8 * z[0] * z[1] / (1 + z[0]) - 0.4 * z[1]],
+        states=2, diffusion=lambda z: [[0.08 * z[0], 0], [0, 0.08 * z[1]]],
+    )  # fmt: skip
+    start, safe = cb.Box([0.9, 1.2], [1.1, 1.4]), cb.Inside(cb.Box([0.2, 0.3], [3, 3]))
+    problem = cb.Problem(system, initial=start, safe=[safe], horizon=10, delta=0.1)
+    assert ENGINES["values"].prove(problem, Request(thorough=False, bounded=True)).log10_delta <= -1

@@ -218,9 +218,10 @@ def _promising(
     """The proposal whose bound will be the smallest where V is the ``level``, or over the starts.
 
     The monotone ones are asked where splines through V break down, or the proof would lose much. ``kinds`` are tried
-    in turn, and what breaks down becomes the last of them.
+    in turn, and what breaks down becomes the last of them; where nothing is promised the nearest alone stays.
     """
     best: Sketch | None = None
+    nearest: Propose | None = None
     for propose in list(kinds := _several() if kinds is None else kinds):
         tops = _SLOPING if held_anywhere(plane) else _TOPS if propose is propose_plane else _TOPS[1:]
         found = _refined(plane, model, plan, level, propose, tops)
@@ -230,10 +231,11 @@ def _promising(
         if best is not None and found.start >= best.estimate():
             break
         if best is None or found.estimate() < best.estimate():
-            best = found
+            best, nearest = found, propose
         if best.estimate() < best.start + _POOR:
             break
     if best is None or (level is None and best.estimate() >= 0):
+        kinds[:] = kinds if nearest is None else [nearest]
         return None
     return best.surface if covers(best.surface, plane.horizon, plane.low, plane.high, within=True) else None
 

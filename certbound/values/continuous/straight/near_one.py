@@ -45,6 +45,7 @@ _RARE = math.log(1e-3)  # below that logarithms serve better and need the time; 
 _RAREST = math.log(1e-6)  # below that there are none of those
 _FEWEST, _MOST = 14, 60  # cells along each state
 _COARSE = 0.55  # of the cells that may be afforded, for a first grid
+_FINER, _HOPED = 34, 30.0  # cells that are granted anyway where nothing was proved, at such a promise (P)
 _COST = 0.01  # about the seconds of both sides, over cells^2
 _SHARE = 0.58  # of what may be spent, for the finer grid
 _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noises: lower bounds need more
@@ -89,12 +90,15 @@ def bound_between(
             return logs
         return _with_rare(problem, model, outer, granted, level, logs)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
-    above, below = list[Proposed](), list[Proposed]()
+    above, below, hopes = list[Proposed](), list[Proposed](), list[float]()
     most = min(math.sqrt(_SHARE * granted / _COST), _MOST)
-    for cells in sorted({max(round(share * most), _FEWEST) for share in (_COARSE, 1.0)}):
+    grids = sorted({max(round(share * most), _FEWEST) for share in (_COARSE, 1.0)})
+    for number, cells in enumerate((*grids, _FINER)):
+        if number == len(grids) and (upper < 0 or not most + 1 < cells <= 2 * most or min(hopes) > _HOPED):
+            break
         cost = _COST * cells**2
         try:
-            found = _bounded(inner, model, cells, level, None, below=False)
+            found = _bounded(inner, model, cells, level, None, below=False, hopes=hopes)
             done.append(f"{cells}^2")
             if found is not None and found[1].log < upper:
                 above.append(found)
@@ -152,11 +156,12 @@ def _pair(ends: tuple[float, ...]) -> tuple[float, float]:
 
 def _bounded(
     plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool,
-    shares: list[float] | None = None,
+    shares: list[float] | None = None, hopes: list[float] | None = None,
 ) -> Proposed | None:
     """The best bound of a few proposals: corrected by samples of the residual, then by its bounds.
 
-    ``shares`` gets the bounds of log P by `relative_below` (lower ones only), which no certificate states.
+    ``shares`` gets the bounds of log P by `relative_below` (lower ones only), which no certificate states; ``hopes``
+    what each kind of proposal promised.
     """
     rare = shares is not None
     starts, kinds = plane.starts, list[tuple[float, float, Ramps, Surface, Source | None]]()
@@ -167,6 +172,8 @@ def _bounded(
         if eased and solver.plain:  # the same again
             break
         surface, source, value, promised = _corrected(solver, model, points, below, rare)
+        if hopes is not None:
+            hopes.append(promised)
         if surface is not None and 0 < value < 1 and abs(promised - value) < _MUCH * value:
             kinds.append((promised, value, solver, surface, source))
             if promised > 0 and abs(math.log(promised) - level) < _LIKELY:
