@@ -165,8 +165,8 @@ def test_where_failing_is_rare_a_share_of_u_is_paid(monkeypatch) -> None:
 def test_a_grid_as_fine_as_a_first_proposal_hopes_for_is_granted() -> None:
     """Prey and hunters who are sated: no grid that is granted in 5 s proves anything, one twice as fine does."""
     system = cb.ContinuousSystem(
-        lambda z: [z[0] * (1 - z[0] / 3) - z[0] * z[1] / (1 + z[0]), 0.8 * z[0] * z[1] / (1 + z[0]) - 0.4 * z[1]],
-        states=2, diffusion=lambda z: [[0.08 * z[0], 0], [0, 0.08 * z[1]]],
+        lambda x: [x[0] * (1 - x[0] / 3) - x[0] * x[1] / (1 + x[0]), 0.8 * x[0] * x[1] / (1 + x[0]) - 0.4 * x[1]],
+        states=2, diffusion=lambda x: [[0.08 * x[0], 0], [0, 0.08 * x[1]]],
     )  # fmt: skip
     start, safe = cb.Box([0.9, 1.2], [1.1, 1.4]), cb.Inside(cb.Box([0.2, 0.3], [3, 3]))
     problem = cb.Problem(system, initial=start, safe=[safe], horizon=10, delta=0.1)
