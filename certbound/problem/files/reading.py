@@ -112,10 +112,21 @@ class _ProblemReader(SetReader):
                 "every state and a column for every Brownian motion: laws and `matrix` are of discrete time."
             )
         value = table.diffusion
-        if not isinstance(value, list):
-            value = [[value]] if len(self.states) == 1 else value
+        if isinstance(value, dict):
+            for key in value.keys() - set(self.states):
+                raise ValueError(f"unknown key {key!r} in `noise.diffusion`{nearest(key, self.states)}")
+            noisy = [name for name in self.states if name in value]
+            value = [[value[name] if name == column else 0.0 for column in noisy] for name in self.states]
+        elif not isinstance(value, list) and len(self.states) == 1:
+            value = [[value]]
         if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
-            return {"diffusion": self.array(value, "noise.diffusion")}
+            got = f"a list of {len(value)}" if isinstance(value, list) else repr(value)
+            table_of = ", ".join(f"{name} = ..." for name in self.states[:2])
+            raise ValueError(
+                f"`noise.diffusion` must be a matrix with {len(self.states)} rows (one per state), got {got}; write "
+                f"diffusion = {{ {table_of} }} for noises of single states that are independent, or a column "
+                "[[...], [...]] for one common noise."
+            )
         return {"diffusion": self.expressions(value, "noise.diffusion")}
 
     def expressions(self, value: list[Any], name: str) -> Tape:

@@ -200,13 +200,13 @@ class Cost(_Table):
 
 
 class Noise(_Table):
-    """CT: diffusion. DT: a law, its one level, its flags, and a matrix."""
+    """CT: diffusion, a matrix or a table by state. DT: a law, its one level, its flags, and a matrix."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Matrix | Number | Vector | bool]
     title: ClassVar[str] = "[noise]"
     more_keys = staticmethod(lambda: [key for law in LAWS.values() for key in (*law.levels, *law.flags, *law.tables)])
-    diffusion: Matrix | Number | Vector | None = None
+    diffusion: Matrix | Number | Vector | dict[str, Number] | None = None
     law: str | None = None
     matrix: Matrix | Number | Vector | None = None
 

@@ -16,6 +16,12 @@ def test_a_file_says_what_python_says():
     assert dict(loads(COURSE).parameters) == {"sigma": 0.01, "v": 1.0}
 
 
+def test_independent_noises_may_be_a_table_by_state():
+    given = '[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]'
+    problem = loads(changed(COURSE, given, '{ th = "sigma", px = 2 }'))
+    np.testing.assert_array_equal(problem.system.diffusion, [[2, 0], [0, 0], [0, 0.01]])
+
+
 def test_parameters_are_changed_by_name():
     problem = loads(COURSE, sigma=0.2, v=3)
     np.testing.assert_array_equal(problem.system.diffusion, 0.2 * np.eye(3))
@@ -105,8 +111,9 @@ def test_a_thousand_chained_definitions_are_read():
         ('"v*cos(th)"', '"__import__(1)"', "unknown function '__import__'"),
         ('"v*cos(th)"', '"th.real"', "attribute access does not exist here"),
         ("diffusion", "std", "`noise` must hold `diffusion` alone in continuous time, .* got std"),
-        ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "0.1", r"got the scalar 0\.1; write 0\.1 \* np\.eye"),
-        ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "[1, 2, 3]", r"got a vector; write np\.diag"),
+        ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "0.1", r"got 0\.1; write diffusion = \{ px = \.\.\., py"),
+        ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "[1, 2, 'px']", "got a list of 3; write diffusion = "),
+        ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "{ pz = 1 }", "unknown key 'pz' in `noise.diffusion`"),
         ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', '[["sigma"]]', "must have 3 rows|must return 3 rows"),
         ('[["sigma", 0, 0], [0, "sigma", 0], [0, 0, "sigma"]]', "[[1, 2], [1], [1, 2]]", "rows of equal length"),
         ('["sigma", 0, 0]', '["d", 0, 0]', r"`noise\.diffusion\.0\.0`: 'd' must not be used here, only t, px, py, th"),
