@@ -48,7 +48,7 @@ class Reader:
                 raise ValueError(f"`{where}` must be a number, got {str(value).lower()}.")
             return float(value)
         if not quoted and _is_number(value):
-            raise ValueError(f"`{where}` must be a number, got the text {value!r}; write {value.strip()} without quotes.")
+            raise ValueError(f"`{where}` must be a number, got the text {value!r}; write it without quotes.")
         graph = Graph(())
         node = parse(value, graph, {name: graph.const(p) for name, p in self.parameters.items()}, where)
         result = constant(graph, node)

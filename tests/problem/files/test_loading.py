@@ -85,7 +85,7 @@ def test_a_thousand_chained_definitions_are_read():
         ("horizon = 5.0", "horizon = true", "`horizon` must be a number or an expression, got true"),
         ("horizon = 5.0", "horizon = nan", "`horizon` must be a number, got nan"),
         ("horizon = 5.0", "horizon = [1, 2]", r"`horizon` must be a number, got \[1, 2\]"),
-        ("horizon = 5.0", 'horizon = "5"', "`horizon` must be a number, got the text '5'; write 5 without quotes"),
+        ("horizon = 5.0", 'horizon = "5"', "`horizon` must be a number, got the text '5'; write it without quotes"),
         ("during = [0, 2]", 'during = ["0", "2"]', r"`avoid\.0\.during\.0` must be a number, got the text '0'"),
         ("v = 1.0", 'v = "1.0"', r"`parameters\.v` must be a number, got the text '1\.0'"),
         ("delta = 1e-3", "delta = 0", r"`delta` must lie in \(0, 1\), got 0"),

@@ -11,10 +11,10 @@ from scipy.stats import multivariate_normal, norm
 import certbound as cb
 from certbound.gaussian.response import Exceedances, discrete_response
 from certbound.reach.below import least_failing
-from certbound.safety.engines import linear_below
 from certbound.reach.below.pushes import plainly
 from certbound.reach.below.survival import survivors
 from certbound.reach.linear import Linearisation
+from certbound.safety.engines import linear_below
 
 
 def walk(side, steps=4, during=None, start=0.0):
