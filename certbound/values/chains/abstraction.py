@@ -201,7 +201,7 @@ class _Chain:
             ends += [high + _FAR * (high - low) if np.isinf(self.high[i]) else high]
             places = np.array(sorted({ends[0], low, high, ends[1]}))
             away = np.maximum(np.maximum(low - places, places - high), 0.0)
-            axes.append(graded_axis(*ends, places, (high - low + _GROWTH * away) / side, marks))
+            axes.append(graded_axis(ends[0], ends[1], places, (high - low + _GROWTH * away) / side, marks))
         return Grid(axes=tuple(axes))
 
     # ---- the induction ---------------------------------------------------------------------------------------
