@@ -41,12 +41,14 @@ class Reader:
         checked_names("definitions", list(spec.definitions), taken | set(self.networks))
         self.random = {name: read_random(table, self.array, f"random.{name}") for name, table in spec.random.items()}
 
-    def number(self, value: float | str, where: str) -> float:
-        """A number, or the value of an expression in the parameters."""
+    def number(self, value: float | str, where: str, *, quoted: bool = False) -> float:
+        """A number, or the value of an expression in the parameters; in quotes a mere number only if ``quoted``."""
         if not isinstance(value, str):
-            if np.isnan(value):
-                raise ValueError(f"`{where}` must be a number, got nan.")
+            if isinstance(value, bool) or np.isnan(value):
+                raise ValueError(f"`{where}` must be a number, got {str(value).lower()}.")
             return float(value)
+        if not quoted and _is_number(value):
+            raise ValueError(f"`{where}` must be a number, got the text {value!r}; write it without quotes.")
         graph = Graph(())
         node = parse(value, graph, {name: graph.const(p) for name, p in self.parameters.items()}, where)
         result = constant(graph, node)
@@ -54,14 +56,14 @@ class Reader:
             raise ValueError(f"`{where}` must be finite, got {value!r} = {result}.")
         return result
 
-    def array(self, value: Any, where: str) -> Any:
+    def array(self, value: Any, where: str, *, quoted: bool = False) -> Any:
         """A number, vector or matrix of numbers or expressions in the parameters."""
         if isinstance(value, list):
-            return [self.array(entry, f"{where}.{k}") for k, entry in enumerate(value)]
-        return self.number(value, where)
+            return [self.array(entry, f"{where}.{k}", quoted=quoted) for k, entry in enumerate(value)]
+        return self.number(value, where, quoted=quoted)
 
     def matrix(self, value: Any, where: str) -> Array:
-        rows = self.array(value, where)
+        rows = self.array(value, where, quoted=True)  # beside expressions, numbers may be in quotes too
         if isinstance(rows, list) and len({len(row) if isinstance(row, list) else 0 for row in rows}) > 1:
             raise ValueError(f"`{where}` must have rows of equal length.")
         return np.array(rows, dtype=float)
@@ -124,6 +126,13 @@ class Reader:
         if self.folder is None or path.is_absolute() or ".." in path.parts or not isinstance(value, str):
             raise ValueError(f"`{where}` must be a file in the problem file's folder, got {value!r}.")
         return self.folder / path
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
 
 
 def _finite(value: float, where: str) -> float:

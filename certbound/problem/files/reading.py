@@ -75,9 +75,12 @@ class _ProblemReader(SetReader):
         for key in keys - set(self.states):
             raise ValueError(f"unknown key {key!r} in [dynamics]{nearest(key, self.states)}")
         for name in self.states:
-            if not isinstance(spec.dynamics.get(name), (str, int, float)):
-                got = spec.dynamics.get(name, "nothing")
-                raise ValueError(f"`dynamics.{name}` must be an expression, got {got!r}.")
+            if name not in spec.dynamics:
+                raise ValueError(f"`dynamics` must give every state, {name} is missing; write {name} = \"...\".")
+            given = spec.dynamics[name]
+            if isinstance(given, bool) or not isinstance(given, (str, int, float)):
+                got = str(given).lower() if isinstance(given, bool) else repr(given)
+                raise ValueError(f"`dynamics.{name}` must be an expression in quotes, got {got}.")
         where = [f"dynamics.{name}" for name in self.states]
         inputs = ("t", *self.states, *self.inputs, *self.disturbances)
         texts = [spec.dynamics[name] for name in self.states]

@@ -21,6 +21,12 @@ def _no_boolean(value: Any) -> Any:
     return value
 
 
+def _no_text(value: Any) -> Any:
+    if isinstance(value, str):
+        raise ValueError(f"must be a number, got the text {value!r}; parameters are numbers without quotes")
+    return _no_boolean(value)
+
+
 Number = Annotated[float | str, BeforeValidator(_no_boolean)]
 Vector = list[Number]
 Matrix = list[list[Number]]
@@ -233,7 +239,7 @@ class Specification(_Table):
     name: str = "problem"
     delta: Number = 1e-3
     units: dict[str, str] = {}
-    parameters: dict[str, Annotated[float, BeforeValidator(_no_boolean)]] = {}
+    parameters: dict[str, Annotated[float, BeforeValidator(_no_text)]] = {}
     inputs: dict[str, Pair] = {}
     disturbances: dict[str, Pair] = {}
     uncertain: dict[str, Pair] = {}
@@ -269,8 +275,10 @@ def explain(error: ValidationError) -> str:
             plain = f"must be a list of tables; write [[{key}]]"
         if any(line.startswith((f"`{key}`", f"`{key}.")) for line in lines) and plain:
             continue  # another alternative of what was refused already
-        if fault["type"] == "literal_error":
-            plain += f", got {fault['input']!r}"
+        if plain and not fault["type"].startswith(("missing", "too")):
+            got = repr(fault["input"])
+            plain += f", got {got if len(got) <= _LONGEST else got[:_LONGEST] + '...'}"
+        plain = plain or (message if message.startswith("must ") else "")
         line = f"`{key}` {plain}" if plain else f"`{key}`: {message[:1].lower()}{message[1:]}"
         line = line if keys else line.removeprefix("``: ")
         if line not in lines:
@@ -278,6 +286,7 @@ def explain(error: ValidationError) -> str:
     return ", and ".join(lines[:4]) + (", and more" if len(lines) > 4 else "") + "."
 
 
+_LONGEST = 60
 _PLAIN = {
     "missing": "is missing",
     "list_type": "must be a list, such as [0, 1]",

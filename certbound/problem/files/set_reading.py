@@ -69,8 +69,7 @@ class SetReader(Reader):
             raise ValueError(f"`{where}` must not move with t.")
         if region.coordinates is not None:
             order = np.argsort(region.coordinates)
-            if len(order) != len(self.states):
-                raise ValueError(f"`{where}` must give every state.")
+            self._complete(region.coordinates, where)
             shape = {} if table.ellipsoid is None else {"shape": region.shape[np.ix_(order, order)]}
             return replace(region, center=region.center[order], coordinates=None, **shape)
         return region
@@ -78,9 +77,13 @@ class SetReader(Reader):
     def _ordered(self, values: list[Any], coordinates: tuple[int, ...] | None, where: str) -> list[Any]:
         if coordinates is None:
             return values
-        if len(coordinates) != len(self.states):
-            raise ValueError(f"`{where}` must give every state.")
+        self._complete(coordinates, where)
         return [values[coordinates.index(k)] for k in range(len(values))]
+
+    def _complete(self, coordinates: tuple[int, ...], where: str) -> None:
+        absent = [name for k, name in enumerate(self.states) if k not in coordinates]
+        if absent:
+            raise ValueError(f"`{where}` must give every state, {', '.join(absent)} is missing.")
 
     def shape(self, table: Any, kind: str, where: str) -> Any:
         """A set from its table, whose entries are its fields: centres and normals by state."""

@@ -91,8 +91,9 @@ def linear_below(problem: Problem) -> EngineAnswer | None:
     start = ", ".join(rounded(value, up=False, digits=4) for value in found.start)
     when = f"t = {found.time:.4g}" if problem.system.time == "continuous" else f"step {found.time:g}"
     least = math.log10(found.probability)
+    place = f"from what is drawn around ({start})" if problem.initial.random else f"from ({start})"
     words = (
-        f"from ({start}) the noise breaks '{found.label}' by about {when} with a probability of at least "
+        f"{place} the noise breaks '{found.label}' by about {when} with a probability of at least "
         f"{rounded(found.probability, up=False, digits=3)}"
     )
     return EngineAnswer(log10_lower=least - 1e-14 * (1 + abs(least)), method="linear", reason=f"{words}.")

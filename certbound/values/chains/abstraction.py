@@ -3,7 +3,8 @@
 For a cell c, a box w_k of noise of probability at most p_k, and U_{t+1} at least V_{t+1} on every cell,
     V_t(x) <= sum_k p_k max of U_{t+1} over the cells that f(t, c, d) + G(t, c) w_k meets,   x in c,
 whatever the noise does with the state; below with minima, least probabilities, and any one disturbance. Outside the
-grid V is 1, as a constraint is broken there, or 0, where leaving the domain ends a path.
+grid V is 1, as a constraint is broken there, or 0, where leaving the domain ends a path. Where nothing bounds a state
+at some step, the grid ends far beyond simulated paths, and V is taken for 1 there from above, and for 0 from below.
 
 With a target that is to be stayed in, W_t is the probability of failing of who has arrived, by the same step, 1 off the
 target; V_t = W_t on the target.
@@ -21,7 +22,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers, Mask
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Tape
+from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Region
 from certbound.problem.systems import DiscreteSystem
@@ -41,6 +42,9 @@ _QUERY_SECONDS = 7e-8
 _CACHED = 60_000_000  # numbers of images that are kept
 _PARTS = 4
 _MOST_STEPS = 100_000
+_SEEN, _LONG = 500, 5000  # steps of a simulation that are kept, and that it has, at most
+_PATHS, _RARE = 400, 0.005  # simulated paths, and the share of their places at either end for which cells grow
+_GROWTH, _FAR = 16.0, 20.0  # by how much, a length of the rest away, and so many of these away the grid ends
 
 
 def bound_chain(
@@ -51,8 +55,8 @@ def bound_chain(
     Parameters
     ----------
     problem : Problem
-        Discrete time, one or two states that limits or the domain bound at every step, a set of starts, and noise with
-        one or two independent entries of a law known by name.
+        Discrete time, one or two states, a set of starts, and noise with one or two independent entries of a law known
+        by name.
     seconds : float
         About what may be spent, at a fixed rate; the first grid is finished in any case.
     ratio : float
@@ -133,6 +137,7 @@ class _Chain:
             self.horizon = self.window[1]
         self.boxes, self.corners = _disturbances(system)
         self.low, self.high = self._around()
+        self.middle = self._middle() if np.isinf([self.low, self.high]).any() else (self.low, self.high)
         used = [node.args[0] for tape in self._tapes() for node in tape.nodes if node.op == "input"]
         self.steady = 0 not in used and problem.input_sequence is None
 
@@ -150,28 +155,53 @@ class _Chain:
         return [self.problem.closed_loop, *([self.gain] if isinstance(self.gain, Tape) else [])]
 
     def _around(self) -> tuple[Array, Array]:
+        """Ends of what limits or the domain bound at every step, infinite where they do not."""
         if self.problem.ending:
             low, high = np.asarray(self.problem.domain.low), np.asarray(self.problem.domain.high)
         else:
             ends = [box_around(active_at(self.limits, t), self.n, t) for t in range(self.horizon + 1)]
             low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
         for i, name in enumerate(self.problem.system.states):
-            if not np.isfinite([low[i], high[i]]).all() or not low[i] < high[i]:
-                raise InfeasibleError(
-                    f"value functions need bounds on every state, and `{name}` has none at some step: add a constraint "
-                    f"or a `domain` that bounds `{name}` on both sides."
-                )
+            if not low[i] < high[i]:
+                raise InfeasibleError(f"value functions need a safe set with an interior, and `{name}` has none.")
         return low, high
 
+    def _middle(self) -> tuple[Array, Array]:
+        """Ends of where most paths are, limits included: a simulation in floats, of no consequence but for the grid."""
+        rng, hull = np.random.default_rng(0), self.problem.initial.hull()
+        x = rng.uniform(hull.lo, hull.hi, (_PATHS, self.n))
+        tapes, middle = [compile_numpy(tape) for tape in self._tapes()], self.boxes[len(self.boxes) // 2].mid
+        rows, gain, seen = self.problem.input_sequence, self.gain, [np.stack([hull.lo, hull.hi]), x]
+        every = 1 + self.horizon // _SEEN
+        for t in range(min(self.horizon, _LONG)):
+            poll(f"simulated paths, step {t}")
+            inputs = [] if rows is None else list(rows[t])
+            noise = self.noise.sample(rng, _PATHS)
+            with np.errstate(all="ignore"):
+                factor = tapes[1](float(t), *x.T) if isinstance(gain, Tape) else gain.mid
+                x = np.broadcast_to(tapes[0](float(t), *x.T, *inputs, *middle), x.shape)
+                x = x + (factor * noise[:, None, :]).sum(axis=-1)
+                inside = np.all((x >= self.low) & (x <= self.high) & np.isfinite(x), axis=1, keepdims=True)
+            x = np.where(inside, x, hull.lo)
+            seen += [x] if t % every == 0 or t + 1 == self.horizon else []
+        low, high = np.quantile(np.concatenate(seen), [_RARE, 1 - _RARE], axis=0)
+        low, high = np.minimum(low, hull.lo), np.maximum(high, hull.hi)
+        low, high = np.where(np.isinf(self.low), low, self.low), np.where(np.isinf(self.high), high, self.high)
+        least = 1e-3 * (1 + np.abs(low))
+        return np.where(high - low < least, low - least, low), np.where(high - low < least, high + least, high)
+
     def grid(self, side: int) -> Grid:
-        """About so many cells along each side, with faces that follow the axes as nodes."""
+        """About so many cells along each side, with faces that follow the axes as nodes, and more where no limit is."""
         sets = [constraint.region for constraint in self.limits]
         sets += [] if self.target is None else [self.target]
         axes = []
-        for i in range(self.n):
-            low, high = float(self.low[i]), float(self.high[i])
+        for i, (low, high) in enumerate(zip(*self.middle)):
             marks = [place for region in sets if not region.moving for place in _ends(region, self.n, i)]
-            axes.append(graded_axis(low, high, np.array([low, high]), np.full(2, (high - low) / side), marks))
+            ends = [low - _FAR * (high - low) if np.isinf(self.low[i]) else low]
+            ends += [high + _FAR * (high - low) if np.isinf(self.high[i]) else high]
+            places = np.array(sorted({ends[0], low, high, ends[1]}))
+            away = np.maximum(np.maximum(low - places, places - high), 0.0)
+            axes.append(graded_axis(ends[0], ends[1], places, (high - low + _GROWTH * away) / side, marks))
         return Grid(axes=tuple(axes))
 
     # ---- the induction ---------------------------------------------------------------------------------------
@@ -238,11 +268,13 @@ class _Chain:
     def _ringed(self, value: _Sides, shape: tuple[int, ...]) -> _Sides:
         """Tables over the cells with a ring around of what lies outside."""
         outside = 0.0 if self.problem.ending else 1.0
-        pads = [(1, 1)] * self.n + [(0, 0)] * (2 - self.n)
-        return _Sides(
-            above=np.pad(value.above.reshape(shape), pads, constant_values=outside),
-            below=np.pad(value.below.reshape(shape), pads, constant_values=outside),
-        )
+        above, below = value.above.reshape(shape), value.below.reshape(shape)
+        for i in range(2):
+            pads = [(1, 1) if k == i < self.n else (0, 0) for k in range(2)]
+            cut = np.isinf([self.low[i], self.high[i]]) if i < self.n else np.zeros(2, dtype=bool)
+            above = np.pad(above, pads, constant_values=[tuple(np.where(cut, 1.0, outside))] * 2)
+            below = np.pad(below, pads, constant_values=[tuple(np.where(cut, 0.0, outside))] * 2)
+        return _Sides(above=above, below=below)
 
 
 class _Images:

@@ -14,6 +14,7 @@ from certbound.reach.below import least_failing
 from certbound.reach.below.pushes import plainly
 from certbound.reach.below.survival import survivors
 from certbound.reach.linear import Linearisation
+from certbound.safety.engines import linear_below
 
 
 def walk(side, steps=4, during=None, start=0.0):
@@ -149,6 +150,14 @@ def test_a_system_that_fails_often_is_unsafe_at_once():
     verdict = cb.verify_safety(curved([BOX], horizon=1.0).replace(delta=1e-3), method="linear")
     assert verdict.status == "UNSAFE"
     assert "the noise breaks" in verdict.reason
+
+
+def test_of_what_is_drawn_no_single_start_is_said():
+    system = cb.DiscreteSystem(lambda x: 1.0 * x, states=1, noise=cb.Gaussian(std=0.1))
+    problem = cb.Problem(
+        system, initial=cb.GaussianStart([0.0], [[0.01]]), safe=[cb.Inside(cb.Box([-0.2], [0.2]))], horizon=3)
+    assert "from what is drawn around (0) the noise breaks" in linear_below(problem).reason
+    assert "from (0) the noise breaks" in linear_below(problem.replace(initial=[0.0])).reason
 
 
 @pytest.mark.parametrize("options", [

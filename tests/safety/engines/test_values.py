@@ -73,9 +73,9 @@ def test_logarithms_are_rounded_outward(probability: float) -> None:
     assert down <= up <= 0.0
 
 
-def test_a_window_that_bounds_no_state_beyond_it_is_refused_in_words() -> None:
+def test_a_window_that_bounds_no_state_beyond_it_is_served() -> None:
     system = cb.DiscreteSystem(lambda x: 0.9 * x, states=1, noise=cb.Gaussian(std=0.1), noise_matrix=lambda x: [[x[0]]])
     within = cb.Inside(cb.Box([-1], [1]), during=(1, 2))
     answer = values_engine(Problem(system, initial=[0.3], safe=[within], horizon=3))
-    assert not answer.applicable
-    assert "has none at some step" in answer.reason
+    assert answer.applicable
+    assert answer.log10_delta < -10

@@ -1,5 +1,6 @@
 """Chains: bounds around closed forms and simulations, for what other value functions do not serve."""
 
+import itertools
 import json
 import math
 
@@ -7,12 +8,14 @@ import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.checker import check_data
+from certbound.checker.reading import parse
 from certbound.cli.commands.check import proved_certificate
 from certbound.errors import InfeasibleError
 from certbound.problem.files.loading import loads, save
 from certbound.problem.goals import until
 from certbound.simulation.estimates import bound_binomial
-from certbound.values.chains import bound_chain
+from certbound.values.chains import abstraction, bound_chain
 from certbound.values.chains.extremes import Extremes, places
 from certbound.values.chains.pieces import pieces_of
 from certbound.values.discrete import bound_failure
@@ -275,11 +278,41 @@ def test_where_the_model_is_undefined_nothing_is_known():
 
 
 def test_what_chains_do_not_serve():
-    free = contraction(LAWS["triangular"]).replace(safe=[cb.Inside(cb.HalfSpace([1], 1))])
-    with pytest.raises(InfeasibleError, match="`x` has none at some step"):
-        bound_chain(free)
     with pytest.raises(InfeasibleError, match="random start"):
         bound_chain(contraction(LAWS["triangular"]).replace(initial=cb.GaussianStart([0], [[0.01]])))
     three = cb.DiscreteSystem(lambda x: 0.5 * x, states=3, noise=cb.Gaussian(std=0.1))
     with pytest.raises(InfeasibleError, match="one or two states"):
         bound_chain(cb.Problem(three, initial=[0, 0, 0], safe=[cb.Inside(cb.Ball([0, 0, 0], 1))], horizon=2))
+
+
+def halved(law=None, **options):
+    """x gains or loses half of itself: below .3 within three steps only by two losses first, with probability 1/4."""
+    system = cb.DiscreteSystem(
+        lambda x: 1.0 * x, states=["x"], noise=law or cb.Rademacher(scale=0.5), noise_matrix=lambda x: [[x[0]]])
+    given = {"initial": [1.0], "safe": [cb.Inside(cb.HalfSpace([-1.0], -0.3))], "horizon": 3, "delta": 0.3}
+    return cb.Problem(system, **(given | options))
+
+
+def test_a_state_with_a_limit_on_one_side_is_followed_far_beyond_where_paths_are():
+    found = bound_chain(halved(), seconds=1.0)
+    assert 0.2499 < found.lower <= 0.25 <= found.upper < 0.2501
+    late = [cb.Inside(cb.Box([0.3], [3.0]), during=(2, 3))]  # two losses first, or three gains
+    found = bound_chain(halved(safe=late), seconds=1.0)
+    assert 0.37 < found.lower <= 0.375 <= found.upper < 0.38
+
+
+def test_where_the_grid_ends_is_of_no_consequence_but_for_the_bounds(monkeypatch):
+    monkeypatch.setattr(abstraction, "_FAR", 0.0)
+    monkeypatch.setattr(abstraction, "_RARE", 0.4)
+    cut = bound_chain(halved(horizon=5), seconds=0.1)
+    paths = [np.cumprod(1 + 0.5 * np.array(signs)) for signs in itertools.product([1, -1], repeat=5)]
+    truth = np.mean([path.min() < 0.3 for path in paths])
+    assert cut.lower < truth - 0.01
+    assert cut.upper > truth + 0.01
+
+
+def test_a_random_walk_on_one_side_is_safe_with_a_certificate():
+    problem = halved(cb.Triangular(halfwidth=0.3), horizon=2)
+    verdict = cb.verify_safety(problem, method="values")
+    assert verdict.status == "SAFE"
+    assert check_data(parse(proved_certificate(problem, verdict))).valid
