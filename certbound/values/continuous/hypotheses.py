@@ -66,10 +66,12 @@ class Model:
         """True when neither depends on t."""
         return self.drift.autonomous and self.square.autonomous
 
-    def counts(self) -> tuple[int, ...]:
-        """Samples in time and in each state with which the residual is a polynomial known exactly."""
+    def counts(self, straight: bool = False) -> tuple[int, ...]:
+        """Samples in time and in each state with which R, or R - Q2 in two, is a polynomial known exactly."""
         n = self.drift.axes - 1
         f, a = self.drift.degrees, self.square.degrees
+        if straight:  # V_y and V_yy are of V's degree in x
+            return (4 + max(f[0], a[0]), *(6 + max(f[1 + i], a[1 + i]) for i in range(n)))
         whole = 3 if n == 3 else 5  # V's degree in each state
         own = 4 if n == 1 else whole  # degree of V_x in its own variable; that of V_y in x is V's
         space = [max(whole, f[1 + i] + own, a[1 + i] + 2 * own) + 1 for i in range(n)]
@@ -104,14 +106,15 @@ class Need:
 
 
 def examine(
-    surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None, alive: Mask | None = None
+    surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None, alive: Mask | None = None,
+    straight: bool = False,
 ) -> Proof:
     """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it.
 
     ``near``, shape (slabs, *cells), says how far from samples of R its bound may lie where that is nothing to lose.
     Where ``alive``, shape ``cells``, is false nothing is looked at: every path there has come to its end.
     """
-    counts = model.counts()
+    counts = model.counts(straight)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
     share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
@@ -130,8 +133,9 @@ def examine(
             return None
         close = np.maximum(share[ends[0] + kept // per] * need.free(high[kept]), loose[ends[0] * per + kept])
         ranges = bound_ranges(
-            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=close, upper=upper
-        )
+            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=close, upper=upper,
+            straight=straight,
+        )  # fmt: skip
         return ends[0] * per + kept, ranges
 
     found = [one for one in side_by_side(look, list(surface.chunks())) if one is not None]
@@ -301,14 +305,14 @@ def prove_lower(
 
 def proved_lower(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
-    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (), near: Array | None = None,
+    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (), near: Array | None = None, straight: bool = False,
 ) -> tuple[Payment | None, Proof]:
     """The same with what was seen, if a start is in the grid; ``near`` is that of `examine`."""
     surface = _sunk(surface)
     start = -up(-extreme_over(surface, starts, upper=False, points=points))
     end = surface.highest_end(cut)
     need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf, bottom=end)
-    proof = examine(surface, model, need, upper=False, near=near)
+    proof = examine(surface, model, need, upper=False, near=near, straight=straight)
     return _earned(proof, need, surface, start, end), proof
 
 

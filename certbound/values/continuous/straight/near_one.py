@@ -53,6 +53,8 @@ _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0)  # both where failing is rare
 _BELOW = 0.43  # of what may be spent, for a lower bound then
 _FINE = 30  # cells along each state, without which nothing comes of it
+_LONG = 0.04  # a ramp's share of the horizon then: fronts that start with it are as wide as cells
+_ENOUGH_RARE = 0.5
 _SPARED = 0.03  # of U, which need not be carried then
 _VAIN = 0.1  # of the cost, of a proposal that is not proved
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
@@ -162,25 +164,26 @@ def _bounded(
     starts, kinds = plane.starts, list[tuple[float, float, Ramps, Surface, Source | None]]()
     for eased in (False, True):
         solver = Ramps(
-            plane, cells, ramp_of(cells) * plane.horizon, _MARGIN[below], eased=eased, below=below, finely=rare
+            plane, cells, (_LONG if rare else ramp_of(cells)) * plane.horizon, _MARGIN[below], eased=eased, below=below, finely=rare
         )
         if eased and solver.plain:  # the same again
             break
         surface, source, value, promised = _corrected(solver, model, points, below, rare)
         if surface is not None and 0 < value < 1 and abs(promised - value) < _MUCH * value:
             kinds.append((promised, value, solver, surface, source))
-            if promised > 0 and abs(math.log(promised) - level) < _LIKELY:
+            if promised > 0 and abs(math.log(promised) - level) < (_ENOUGH_RARE if rare else _LIKELY):
                 break
     if not kinds:
         return None
     _, value, solver, surface, source = (max if below else min)(kinds, key=lambda one: one[0])
+    small = solver.small
     best: Proposed | None = None
     for factor in (*(_GENTLY[1] if rare else _AGAIN), None):
-        spare = NEGLIGIBLE * SMALL * value
+        spare = NEGLIGIBLE * small * value
         payment: Payment | None
-        near = SMALL * _SPARED / plane.horizon * _least(surface) if rare else None
+        near = small * _SPARED / plane.horizon * _least(surface, small) if rare else None
         if below:
-            payment, proof = proved_lower(surface, model, starts, points, spare, plane.cut, near)
+            payment, proof = proved_lower(surface, model, starts, points, spare, plane.cut, near, rare)
             needed = -proof.ranges.residual_low
         else:
             payment, proof = proved_upper(surface, model, starts, (), spare)
@@ -192,10 +195,10 @@ def _bounded(
         if factor is None or not np.isfinite(needed).all():
             break
         table = np.zeros((surface.slabs, surface.cells[0] * surface.cells[1]))
-        table[proof.slab, proof.cell] = np.maximum(needed, 0.0) / SMALL
+        table[proof.slab, proof.cell] = np.maximum(needed, 0.0) / small
         table = table.reshape(surface.slabs, *surface.cells)
         if rare:
-            table = np.maximum(table - _SPARED / plane.horizon * _least(surface), 0.0)
+            table = np.maximum(table - _SPARED / plane.horizon * _least(surface, small), 0.0)
         if table.max(axis=(1, 2)) @ surface.steps < _LEFT * value:
             break
         source = _more(source, surface, factor * table)
@@ -207,22 +210,22 @@ def _corrected(
     solver: Ramps, model: Model, points: Array | None, below: bool, rare: bool = False
 ) -> tuple[Surface | None, Source | None, float, float]:
     """The proposal that promises most, its source, U at the starts and about the bound."""
-    plane, source = solver.plane, None
+    plane, source, small = solver.plane, None, solver.small
     best: tuple[Surface | None, Source | None, float, float] = None, None, 0.0, math.inf
     sign, least = -1 if below else 1, math.inf
     for factor in (*(_GENTLY[0] if rare else _FACTORS), None):
         surface = solver.surface(source, below=below)
         if not covers(surface, plane.horizon, plane.low, plane.high, within=not below):
             break
-        value = 1 + extreme_over(surface, plane.starts, upper=not below, points=points) / SMALL
+        value = 1 + extreme_over(surface, plane.starts, upper=not below, points=points) / small
         excess, level = sampled_residual(surface, model, upper=not below, along=6)
-        asked = level > -SMALL if below else level < 0  # where 0 < U < 1
-        needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / SMALL
+        asked = level > -small if below else level < 0  # where 0 < U < 1
+        needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / small
         paid = float(needed.max(axis=(1, 2)) @ surface.steps)
         if rare:  # as a share of U and what it is at the starts
-            share = needed / (_least(surface) + value)
+            share = needed / (_least(surface, small) + value)
             paid = min(paid, 2 * value * float(share.max(axis=(1, 2)) @ surface.steps))
-            needed = np.maximum(needed - _SPARED / plane.horizon * _least(surface), 0.0)
+            needed = np.maximum(needed - _SPARED / plane.horizon * _least(surface, small), 0.0)
         if not math.isfinite(paid) or value <= 0:
             break
         if best[0] is None or sign * (value - best[3]) + paid < 0:
@@ -239,7 +242,7 @@ def _more(source: Source | None, surface: Surface, needed: Array) -> Source:
     return more if source is None else source.plus(more)
 
 
-def _least(surface: Surface) -> Array:
+def _least(surface: Surface, small: float) -> Array:
     """The least U of each patch, 0 where it is less."""
     low = [value_range(surface.patches(*chunk))[0] for chunk in surface.chunks()]
-    return np.maximum(1 + np.concatenate(low) / SMALL, 0.0).reshape(surface.slabs, *surface.cells)
+    return np.maximum(1 + np.concatenate(low) / small, 0.0).reshape(surface.slabs, *surface.cells)

@@ -45,6 +45,7 @@ Solve = Callable[[Array], Array]
 SHIFT = 2.5
 SMALL = 2.0**-8
 """e of V = e (U - 1)."""
+_SMALLER = 2.0**-16  # where failing is rare: Q2 is next to nothing then, and left out
 _LEAD = 6.0  # over cells^2: a ramp's share of the horizon
 _RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a ramp
 _GROWTH = 0.5  # a step over tau, at most
@@ -84,6 +85,7 @@ class Ramps:
         finely: bool = False,
     ) -> None:
         self.plane, self.lead, self.longest = plane, lead, _FINELY if finely else _LONGEST
+        self.small = _SMALLER if finely else SMALL
         nodes = [self.grid(axis, Plan(cells=cells, growth=_GROWTH, lead=lead)) for axis in (0, 1)]
         shared = _correlation(plane, nodes)
         wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
@@ -240,10 +242,10 @@ class Ramps:
     def scaled(self, whole: Surface, below: bool) -> Surface:
         """V = e (U - 1) from U itself."""
         # U may rise over 1 beside corners
-        scale = SMALL / (max(1.0, top_of(whole)) if below else max(self.least(whole), 0.5))
+        scale = self.small / (max(1.0, top_of(whole)) if below else max(self.least(whole), 0.5))
         return replace(
             whole, values=scale * whole.values, start_rates=scale * whole.start_rates, end_rates=scale * whole.end_rates
-        ).raised(-SMALL)
+        ).raised(-self.small)
 
 
 def ramp_of(cells: int) -> float:
