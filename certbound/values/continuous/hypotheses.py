@@ -70,8 +70,8 @@ class Model:
         """Samples in time and in each state with which R, or R - Q2 in two, is a polynomial known exactly."""
         n = self.drift.axes - 1
         f, a = self.drift.degrees, self.square.degrees
-        if straight:  # V_y and V_yy are of V's degree in x
-            return (4 + max(f[0], a[0]), *(6 + max(f[1 + i], a[1 + i]) for i in range(n)))
+        if straight:
+            return (4 + max(f[0], a[0]), *(6 + max(pair) for pair in zip(f[1:], a[1:])))
         whole = 3 if n == 3 else 5  # V's degree in each state
         own = 4 if n == 1 else whole  # degree of V_x in its own variable; that of V_y in x is V's
         space = [max(whole, f[1 + i] + own, a[1 + i] + 2 * own) + 1 for i in range(n)]
@@ -200,8 +200,7 @@ def interpolants(
 def _cells(surface: Surface, first: int, last: int) -> Cells:
     ends = [(surface.times[first:last], surface.times[first + 1 : last + 1])]
     ends += [(axis[:-1], axis[1:]) for axis in surface.axes]
-    low = np.meshgrid(*(pair[0] for pair in ends), indexing="ij")
-    high = np.meshgrid(*(pair[1] for pair in ends), indexing="ij")
+    low, high = (np.meshgrid(*(pair[side] for pair in ends), indexing="ij") for side in (0, 1))
     return Cells(low=tuple(array.ravel() for array in low), high=tuple(array.ravel() for array in high))
 
 
@@ -305,18 +304,17 @@ def prove_lower(
 
 def proved_lower(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
-    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (), near: Array | None = None, straight: bool = False,
+    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (),
 ) -> tuple[Payment | None, Proof]:
-    """The same with what was seen, if a start is in the grid; ``near`` is that of `examine`."""
-    surface = _sunk(surface)
-    start = -up(-extreme_over(surface, starts, upper=False, points=points))
-    end = surface.highest_end(cut)
+    """The same with what was seen, if a start is in the grid."""
+    surface = sunk(surface)
+    start, end = -up(-extreme_over(surface, starts, upper=False, points=points)), surface.highest_end(cut)
     need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf, bottom=end)
-    proof = examine(surface, model, need, upper=False, near=near, straight=straight)
+    proof = examine(surface, model, need, upper=False)
     return _earned(proof, need, surface, start, end), proof
 
 
-def _sunk(surface: Surface) -> Surface:
+def sunk(surface: Surface) -> Surface:
     """The surface, lowered until V <= 0 everywhere."""
     return surface.raised(-highest - 1e-12 * (1 + highest)) if (highest := top_of(surface)) > 0 else surface
 
@@ -334,7 +332,7 @@ def chart_below(
     cut: Sequence[Sides] = (),
 ) -> list[Chart]:
     """Lower bounds of P(leaving the box from a cell on), as `chart_above`, but not through a mere ``cut``."""
-    surface = _sunk(surface)
+    surface = sunk(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=np.inf)
     proof = examine(surface, model, need, upper=False)
     found = [_earned(proof, need, surface, level, surface.highest_end(cut)) for level in levels]

@@ -51,7 +51,8 @@ _RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a
 _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
 _LONGEST = 8  # steps of the horizon, at least
-_FINELY = 24  # the same where failing is rare
+_FINELY, _SLOWLY = 24, 0.2  # both where failing is rare
+_SOONER = 2.0  # ramps that U starts before T then
 _CLOSELY = 0.25  # correlated: a wider box
 _PAST = 0.05  # d: how far beyond 0 and 1 U is where it is given up
 _ZONE = 6  # cells at a face where the drift back is weakened
@@ -85,7 +86,8 @@ class Ramps:
         finely: bool = False,
     ) -> None:
         self.plane, self.lead, self.longest = plane, lead, _FINELY if finely else _LONGEST
-        self.small = _SMALLER if finely else SMALL
+        self.small, self.growth = (_SMALLER, _SLOWLY) if finely else (SMALL, _GROWTH)
+        self.shift = _SOONER if finely else self.shift
         nodes = [self.grid(axis, Plan(cells=cells, growth=_GROWTH, lead=lead)) for axis in (0, 1)]
         shared = _correlation(plane, nodes)
         wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
@@ -165,7 +167,7 @@ class Ramps:
     def surface(self, source: Source | None, *, below: bool) -> Surface:
         """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
         horizon, shift = self.plane.horizon, 0.0 if below else self.shift * self.lead
-        times, first = _times(horizon, shift, self.lead, self.longest)
+        times, first = _times(horizon, shift, self.lead, (self.longest, self.growth))
         sign = -1.0 if below else 1.0
         given = None if source is None else sign * self.fed(source)
         value = self.first
@@ -286,11 +288,11 @@ def _at(times: Array, values: Array, t: float) -> Array:
     return np.asarray((1 - share) * values[left] + share * values[left + 1]).ravel()
 
 
-def _times(horizon: float, shift: float, lead: float, longest: int) -> tuple[Array, int]:
+def _times(horizon: float, shift: float, lead: float, longest: tuple[int, float]) -> tuple[Array, int]:
     """Ends of the steps, one of them at ``shift`` and the last one at shift + horizon, and the first one's number."""
     step, steps = _FIRST * lead, [_FIRST * lead]
     while sum(steps) < horizon + shift:
-        while 2 * step <= min(_GROWTH * (sum(steps) + 2 * _FIRST * lead), horizon / longest):
+        while 2 * step <= min(longest[1] * (sum(steps) + 2 * _FIRST * lead), horizon / longest[0]):
             step *= 2
         steps.append(step)
     times = np.concatenate([[0.0], np.cumsum(steps)])
