@@ -323,8 +323,7 @@ def _earned(proof: Proof, need: Need, surface: Surface, start: float, end: float
     """``end`` bounds V from above where paths end without having failed."""
     if np.any(proof.ranges.high > 0):
         return None
-    patched = patched_of(proof, -proof.ranges.residual_low, need, surface.steps)
-    return pay_lower(patched, start, end)
+    return pay_lower(patched_of(proof, -proof.ranges.residual_low, need, surface.steps), start, end)
 
 
 def chart_below(
@@ -367,8 +366,7 @@ def chained(parts: Sequence[Patched], surfaces: Sequence[Surface], need: Need) -
         name: np.concatenate([getattr(part, name) for part in parts]) for name in ("excess", "low", "high", "energy")
     }
     slab = np.concatenate([part.slab + count for part, count in zip(parts, before)])
-    steps = np.concatenate([surface.steps for surface in surfaces])
-    return Patched(**together, slab=slab, steps=steps, spare=need.spare)
+    return Patched(**together, slab=slab, steps=np.concatenate([one.steps for one in surfaces]), spare=need.spare)
 
 
 def extreme_over(

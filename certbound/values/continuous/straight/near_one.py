@@ -68,7 +68,9 @@ _LIKELY = 0.15  # of log P: as near to a rough guess nothing is wrong
 _ENOUGH = 0.25  # and nothing else is tried
 
 
-def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wanted: float) -> Found:
+def bound_plane(
+    problem: Problem, model: Model, room: Room, deadline: float, wanted: float, *, above: bool = True
+) -> Found:
     """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
     inner = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     outer = replace(inner, low=_pair(room.outer_low), high=_pair(room.outer_high))
@@ -78,11 +80,12 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
     if wanted < math.inf:
         check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
-    return bound_between(problem, model, inner, outer, deadline, wanted, other)
+    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above)
 
 
 def bound_between(
-    problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other
+    problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other,
+    *, looked: bool = True,
 ) -> Found:
     """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due."""
     granted = round(deadline - time.perf_counter(), 1)
@@ -91,7 +94,7 @@ def bound_between(
     if not served or not _RARE < level < 0:
         rare = served and _RAREST < level <= _RARE and round(math.sqrt(_ABOVE * granted / _RARELY)) >= _FINE
         if rare:
-            return _with_rare(problem, model, (inner, outer), granted, level, wanted, other)
+            return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked)
         return other(time.perf_counter() + granted, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below = list[Proposed](), list[Proposed]()
@@ -135,28 +138,29 @@ def bound_between(
 
 def _with_rare(
     problem: Problem, model: Model, boxes: tuple[Plane, Plane | None], granted: float, level: float, wanted: float,
-    other: Other,
+    other: Other, looked: bool,
 ) -> Found:
     """Both bounds where failing is rare: by logarithms, which certificates state, where these may do for ``wanted``.
 
-    Then shares of U are paid, first from above, and logarithms serve where nothing comes of that.
+    Then shares of U are paid, first from above if that is ``looked`` for, and logarithms serve where that fails.
     """
     inner, outer = boxes
     cells = [round(math.sqrt(share * granted / _RARELY)) for share in (_ABOVE, _BELOW)]
     upper, least, words = 0.0, None, "value function in two states, cells: "
     proposed = list[Proposed](), list[Proposed]()
-    if wanted >= level - _LIKELY:
+    if looked and wanted >= level - _LIKELY:
         upper, least, words, proposed = other(time.perf_counter() + granted, math.inf)
         if upper <= wanted:
             return upper, least, words, proposed
         words += ", "
     with contextlib.suppress(OutOfTime):
-        found = rarely(inner, model, cells[0], level, None, below=False)
-        upper, words = min(upper, 0.0 if found is None else found), f"{words}{cells[0]}^2"
+        if looked:
+            found = rarely(inner, model, cells[0], level, None, below=False)
+            upper, words = min(upper, 0.0 if found is None else found), f"{words}{cells[0]}^2"
         if upper > wanted and outer is not None and wanted < math.inf:
             least = rarely(outer, model, cells[1], level, points_of(problem), below=True)
             words += f", {cells[1]}^2 below"
-    done = upper <= wanted or upper < level + _FAR
+    done = not looked or upper <= wanted or upper < level + _FAR
     if done and (least is not None or upper <= wanted or outer is None or wanted == math.inf):
         return upper, least, words, proposed
     logs = other(time.perf_counter() + granted, wanted)

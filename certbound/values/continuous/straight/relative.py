@@ -1,9 +1,17 @@
-"""Lower bounds where failing is rare: what is lost is paid as a share of U, and only the rest by an amount.
+"""Bounds where failing is rare: what is lost is paid as a share of U, and only the rest by an amount.
 
 e^V solves the linear equation but for e^V R, and so does W = e^V - k for every number k. With k a little below e^-e,
-W is about e (U + c), c small. So R >= -lam W - eps where V is above what it is where paths end without having failed
-is the theorem's hypothesis for log W / (1 - k) in place of V (V <= 0 on faces; e^V R >= R e^h where R < 0 and V <= h):
-on a patch the least R and the least W decide. In the layers at faces, where a proposal is worst, W is large.
+W is about e (U + c), c small.
+
+*Below.* R >= -lam W - eps where V is above what it is where paths end without having failed is the theorem's hypothesis
+for log W / (1 - k) in place of V (V <= 0 on faces; e^V R >= R e^h where R < 0 and V <= h): on a patch the least R and
+the least W decide. In the layers at faces, where a proposal is worst, W is large.
+
+*Above.* k is below e^V all over the box, so that W > 0, and log W / (1 - k) >= 0 exactly where V >= 0. Where V < 0
+and R > 0, e^V R <= R, so that R <= lam W + eps is the hypothesis of the upper theorem for it, with m = 0.
+
+e is so small that Q2, of order e^2, is next to nothing: it is bounded by the sizes of its terms from above, and by 0
+from below, and the rest of R, which is linear, is a polynomial of lower degree.
 """
 
 from __future__ import annotations
