@@ -358,7 +358,7 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
                 reason=f"{answer.reason.rstrip('.')}; in the coordinates {names}.", details=details,
             )  # fmt: skip
 
-        inner = replace(asked, before=before and before.answer.details, found=lambda answer: asked.found(stated(answer)))
+        inner = replace(asked, before=before and before.answer.details, found=lambda one: asked.found(stated(one)))
         found: EngineAnswer | None = None
         ended, left = True, seconds_left()
         with share_of_time(_HALF):
@@ -394,7 +394,7 @@ def _raised(prove: Prove, problem: Problem, asked: Request, answer: EngineAnswer
     asked.found(answer)
     with contextlib.suppress(InfeasibleError, EnclosureError):
         other = logarithmic(problem, below=True)
-        again = None if other is None else prove(other[1], replace(asked, before=None, below=True, found=lambda _: None))
+        again = other and prove(other[1], replace(asked, before=None, below=True, found=lambda _: None))
         if again is not None and again.applicable and again.log10_lower is not None:
             return replace(answer, log10_lower=max(again.log10_lower, answer.log10_lower or again.log10_lower))
     return answer
