@@ -141,6 +141,7 @@ class Request:
     again where that matters, with the ``details`` of its first answer as ``before``. ``bounded``: some probability
     below 1 is proved, and what has no hope of delta may be left out. ``first``: it may end with the first bound that it
     finds, and goes on from there when it is asked again. ``at_length``: all the time that is left is its own.
+    ``below``: a lower bound is all that is wanted, where that is less work.
     ``found`` takes an answer that holds already while the engine looks for a better one: it stands where time ends the
     search (`certbound.watch`).
     """
@@ -153,6 +154,7 @@ class Request:
     first: bool = False
     bounded: bool = False
     at_length: bool = False
+    below: bool = False
     before: Any = None
     found: Callable[[EngineAnswer], object] = lambda answer: None
 

@@ -46,7 +46,7 @@ _MOST = 20  # states
 _LONGEST = 4000  # operations of a model that is looked through for sums
 _UNLIKE = 5  # the logarithm to the base 2 of states' ratio from which they are asked in other units, too
 _FAR = 12  # and first
-_MORE = 0.05  # log10, of a lower bound
+_MORE, _NEAR = 0.05, 0.5  # log10: of a lower bound; between both, where the states need not be asked
 _HALF = 0.5  # of the time that is left, for logarithms, and for limits along the axes
 _SHARES = (0.0, *(sign * 2.0**k for k in range(-4, 3) for sign in (1, -1)))  # of another state, which a shear takes
 
@@ -358,8 +358,7 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
                 reason=f"{answer.reason.rstrip('.')}; in the coordinates {names}.", details=details,
             )  # fmt: skip
 
-        earlier = before and before.answer.details
-        inner = replace(asked, before=earlier, found=lambda answer: asked.found(stated(answer)))
+        inner = replace(asked, before=before and before.answer.details, found=lambda one: asked.found(stated(one)))
         found: EngineAnswer | None = None
         ended, left = True, seconds_left()
         with share_of_time(_HALF):
@@ -375,7 +374,9 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
             asked.found(stated(found))
         if found is not None and again and not asked.thorough:
             return stated(found)
-        plain = prove(problem, replace(asked, before=before.plain.details if before else asked.before))
+        near = found is not None and useful and (found.log10_lower or -math.inf) > found.log10_delta - _NEAR
+        old = before.plain.details if before else asked.before
+        plain = _UNASKED if near else prove(problem, replace(asked, before=old))
         if found is not None and useful and not (plain.applicable and plain.log10_delta <= found.log10_delta):
             return _raised(prove, problem, asked, stated(found, plain), found.log10_lower)
         return plain
@@ -393,7 +394,7 @@ def _raised(prove: Prove, problem: Problem, asked: Request, answer: EngineAnswer
     asked.found(answer)
     with contextlib.suppress(InfeasibleError, EnclosureError):
         other = logarithmic(problem, below=True)
-        again = None if other is None else prove(other[1], replace(asked, before=None, found=lambda _: None))
+        again = other and prove(other[1], replace(asked, before=None, below=True, found=lambda _: None))
         if again is not None and again.applicable and again.log10_lower is not None:
             return replace(answer, log10_lower=max(again.log10_lower, answer.log10_lower or again.log10_lower))
     return answer

@@ -50,7 +50,7 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         if problem.reach is None and serves(problem):
             return _continuous(_confined(problem, limit) or bound_exits_by_steps(problem, seconds=limit))
         if not isinstance(problem.system, DiscreteSystem):
-            answer = _continuous(_exits(problem, limit, spare=asked.bounded and not asked.thorough))
+            answer = _continuous(_exits(problem, limit, asked))
             return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer
         found = _failure(problem, limit)
     except (InfeasibleError, EnclosureError) as error:
@@ -172,10 +172,10 @@ def _confined(problem: Problem, limit: float) -> ExitBounds | None:
     return found if found is not None and found.upper < 0 else None
 
 
-def _exits(problem: Problem, limit: float, *, spare: bool) -> ExitBounds:
-    target = problem.reach
+def _exits(problem: Problem, limit: float, asked: Request) -> ExitBounds:
+    target, spare = problem.reach, asked.bounded and not asked.thorough
     if target is None:
-        return bound_exits(problem, seconds=limit, delta=problem.delta, spare=spare)
+        return bound_exits(problem, seconds=limit, delta=problem.delta, spare=spare, above=not asked.below)
     first, last = target.during or (0.0, float(problem.horizon))
     if first > 0:
         raise InfeasibleError("value functions in continuous time need a target that counts from the beginning.")

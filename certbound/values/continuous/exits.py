@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ class ExitBounds:
 
 def bound_exits(
     problem: Problem, *, target: Any = None, seconds: float = 10.0, lower: bool = True, delta: float = 0.0,
-    spare: bool = False,
+    spare: bool = False, above: bool = True,
 ) -> ExitBounds:
     """Bound P(X_t leaves the safe set for some t <= T) from above and from below by Theorem K8-CT.
 
@@ -94,6 +95,8 @@ def bound_exits(
         Where the upper bound is at most this, no lower bound is looked for in two states, which takes as long again.
     spare : bool
         In three states: stop where a rough guess says that this is out of reach.
+    above : bool
+        In two states: without it no upper bound is looked for where the lower one does not need it.
 
     Returns
     -------
@@ -161,7 +164,8 @@ def bound_exits(
 
         _refuse_random(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
-        way, room = (two_states, limits_of(problem)) if led(model) else (bound_plane, safe_room(problem))
+        straight = partial(bound_plane, above=above)
+        way, room = (two_states, limits_of(problem)) if led(model) else (straight, safe_room(problem))
         upper, least, words, (proposed, below) = way(problem, model, room, begin + seconds, wanted)
     if problem.ending and ended is None:  # leaving the domain was counted as failing
         least, below = None, ()

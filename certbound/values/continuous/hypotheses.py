@@ -66,10 +66,12 @@ class Model:
         """True when neither depends on t."""
         return self.drift.autonomous and self.square.autonomous
 
-    def counts(self) -> tuple[int, ...]:
-        """Samples in time and in each state with which the residual is a polynomial known exactly."""
+    def counts(self, straight: bool = False) -> tuple[int, ...]:
+        """Samples in time and in each state with which R, or R - Q2 in two, is a polynomial known exactly."""
         n = self.drift.axes - 1
         f, a = self.drift.degrees, self.square.degrees
+        if straight:
+            return (4 + max(f[0], a[0]), *(6 + max(pair) for pair in zip(f[1:], a[1:])))
         whole = 3 if n == 3 else 5  # V's degree in each state
         own = 4 if n == 1 else whole  # degree of V_x in its own variable; that of V_y in x is V's
         space = [max(whole, f[1 + i] + own, a[1 + i] + 2 * own) + 1 for i in range(n)]
@@ -104,14 +106,15 @@ class Need:
 
 
 def examine(
-    surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None, alive: Mask | None = None
+    surface: Surface, model: Model, need: Need, *, upper: bool, near: Array | None = None, alive: Mask | None = None,
+    straight: bool = False,
 ) -> Proof:
     """Enclose R (closely on one side), V and Q2 on every patch of a surface that needs it.
 
     ``near``, shape (slabs, *cells), says how far from samples of R its bound may lie where that is nothing to lose.
     Where ``alive``, shape ``cells``, is false nothing is looked at: every path there has come to its end.
     """
-    counts = model.counts()
+    counts = model.counts(straight)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
     share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
@@ -130,8 +133,9 @@ def examine(
             return None
         close = np.maximum(share[ends[0] + kept // per] * need.free(high[kept]), loose[ends[0] * per + kept])
         ranges = bound_ranges(
-            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=close, upper=upper
-        )
+            patches.take(kept), drifts, squares, place[kept], counts, wanted=need.spare, near=close, upper=upper,
+            straight=straight,
+        )  # fmt: skip
         return ends[0] * per + kept, ranges
 
     found = [one for one in side_by_side(look, list(surface.chunks())) if one is not None]
@@ -196,8 +200,7 @@ def interpolants(
 def _cells(surface: Surface, first: int, last: int) -> Cells:
     ends = [(surface.times[first:last], surface.times[first + 1 : last + 1])]
     ends += [(axis[:-1], axis[1:]) for axis in surface.axes]
-    low = np.meshgrid(*(pair[0] for pair in ends), indexing="ij")
-    high = np.meshgrid(*(pair[1] for pair in ends), indexing="ij")
+    low, high = (np.meshgrid(*(pair[side] for pair in ends), indexing="ij") for side in (0, 1))
     return Cells(low=tuple(array.ravel() for array in low), high=tuple(array.ravel() for array in high))
 
 
@@ -301,18 +304,17 @@ def prove_lower(
 
 def proved_lower(
     surface: Surface, model: Model, starts: Sequence[tuple[float, float]], points: Array | None = None,
-    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (), near: Array | None = None,
+    negligible: float = NEGLIGIBLE, cut: Sequence[Sides] = (),
 ) -> tuple[Payment | None, Proof]:
-    """The same with what was seen, if a start is in the grid; ``near`` is that of `examine`."""
-    surface = _sunk(surface)
-    start = -up(-extreme_over(surface, starts, upper=False, points=points))
-    end = surface.highest_end(cut)
+    """The same with what was seen, if a start is in the grid."""
+    surface = sunk(surface)
+    start, end = -up(-extreme_over(surface, starts, upper=False, points=points)), surface.highest_end(cut)
     need = Need(spare=negligible / float(surface.times[-1]), start=start, top=np.inf, bottom=end)
-    proof = examine(surface, model, need, upper=False, near=near)
+    proof = examine(surface, model, need, upper=False)
     return _earned(proof, need, surface, start, end), proof
 
 
-def _sunk(surface: Surface) -> Surface:
+def sunk(surface: Surface) -> Surface:
     """The surface, lowered until V <= 0 everywhere."""
     return surface.raised(-highest - 1e-12 * (1 + highest)) if (highest := top_of(surface)) > 0 else surface
 
@@ -321,8 +323,7 @@ def _earned(proof: Proof, need: Need, surface: Surface, start: float, end: float
     """``end`` bounds V from above where paths end without having failed."""
     if np.any(proof.ranges.high > 0):
         return None
-    patched = patched_of(proof, -proof.ranges.residual_low, need, surface.steps)
-    return pay_lower(patched, start, end)
+    return pay_lower(patched_of(proof, -proof.ranges.residual_low, need, surface.steps), start, end)
 
 
 def chart_below(
@@ -330,7 +331,7 @@ def chart_below(
     cut: Sequence[Sides] = (),
 ) -> list[Chart]:
     """Lower bounds of P(leaving the box from a cell on), as `chart_above`, but not through a mere ``cut``."""
-    surface = _sunk(surface)
+    surface = sunk(surface)
     need = Need(spare=NEGLIGIBLE / float(surface.times[-1]), start=min(levels), top=np.inf)
     proof = examine(surface, model, need, upper=False)
     found = [_earned(proof, need, surface, level, surface.highest_end(cut)) for level in levels]
@@ -365,8 +366,7 @@ def chained(parts: Sequence[Patched], surfaces: Sequence[Surface], need: Need) -
         name: np.concatenate([getattr(part, name) for part in parts]) for name in ("excess", "low", "high", "energy")
     }
     slab = np.concatenate([part.slab + count for part, count in zip(parts, before)])
-    steps = np.concatenate([surface.steps for surface in surfaces])
-    return Patched(**together, slab=slab, steps=steps, spare=need.spare)
+    return Patched(**together, slab=slab, steps=np.concatenate([one.steps for one in surfaces]), spare=need.spare)
 
 
 def extreme_over(

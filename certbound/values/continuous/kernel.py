@@ -87,9 +87,11 @@ def _extreme_parts(
 @compiled
 def extremes_in_plane(
     coefficients: Array, step: Array, width_x: Array, width_y: Array, place: Index, drift: Array, square: Array,
-    bases: tuple[Array, ...], parts: tuple[Array, ...], wanted: float, out: Array,
+    bases: tuple[Array, ...], parts: tuple[Array, ...], wanted: float, straight: bool, out: Array,
 ) -> None:
     """Write to ``out`` (B, branches, 6): extreme coefficients of R, the least of Q2, extreme samples of R, Q2's size.
+
+    ``straight`` takes 0 for Q2.
 
     ``drift`` has shape (branches, 2, cells, 1 or t, x, y), ``square`` (4, cells, 1 or t, x, y); ``place`` says which
     cell a patch is. ``bases`` are the values of the basis and of its derivatives at the samples: time 0, 1; x 0, 1, 2;
@@ -130,7 +132,7 @@ def extremes_in_plane(
                         a, b = 0.5 * square[0, cell, ia, j, k], 0.5 * square[3, cell, ia, j, k]
                         m = square[1, cell, ia, j, k]
                         gx, gy = vx[i, j, k, s] * wx, vy[i, j, k, s] * wy
-                        e = a * gx * gx + b * gy * gy + m * gx * gy
+                        e = 0.0 if straight else a * gx * gx + b * gy * gy + m * gx * gy
                         vx[i, j, k, s], vy[i, j, k, s], energy[i, j, k, s] = gx, gy, e
                         bends = a * xx[i, j, k, s] * wx * wx + b * yy[i, j, k, s] * wy * wy
                         rest[i, j, k, s] = vt[i, j, k, s] * h + bends + m * xy[i, j, k, s] * wx * wy + e
@@ -152,7 +154,7 @@ def extremes_in_plane(
         top = 0.0
         for s in range(BLOCK):
             low[s], top = 0.0, max(top, look[s])
-        if top > wanted:
+        if top > wanted and not straight:
             _extreme_parts(energy, parts, one, two, result, low, high)
         _extreme(energy, least, most)
         for s in range(min(BLOCK, count - begin)):

@@ -19,6 +19,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -80,6 +81,7 @@ def along(matrix: Array, array: Array, axis: int) -> Array:
 def bound_ranges(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], *, wanted: float = 0.0, near: Array | float = math.inf, upper: bool = True,
+    straight: bool = False,
 ) -> Ranges:
     """Ranges of R (its maximum over the drifts), V and Q2; see the module.
 
@@ -98,6 +100,9 @@ def bound_ranges(
     near : float or ndarray, shape (B,)
         How far from the samples of R its bound, the upper or the lower one, may lie before the halves and quarters of
         a patch are looked at; two or three states.
+    straight : bool
+        Two states: R but for Q2 is bounded closely, and 0 <= Q2 by the sizes of its terms; ``counts`` may be those of
+        the rest then.
 
     Notes
     -----
@@ -105,7 +110,7 @@ def bound_ranges(
     single branches, each of which is a lower bound of the supremum.
     """
     n = len(patches.widths)
-    extremes = (_on_line, _in_plane, _in_space)[n - 1]
+    extremes = _straight if straight else (_on_line, _in_plane, _in_space)[n - 1]
     least, most, floor, largest = extremes(patches, drifts, squares, place, counts, wanted, near, upper)
     error, sizes = _errors(patches, squares.size[:, place], n)
     loss = _diffusive_loss(patches, squares.remainder[:, place], n)
@@ -120,6 +125,7 @@ def bound_ranges(
         slack = (sampled * own + changed * largest[branch] + slack) * (1 + 1e-9)
         high, low = np.maximum(high, most[branch] + slack), np.maximum(low, least[branch] - slack)
     floor = np.maximum(floor - (sampled * error + changed * largest[-1] + loss) * (1 + 1e-9), 0.0)
+    high = high + _most_energy(patches, squares, place, n) if straight else high
     v_low, v_high = value_range(patches)
     return Ranges(residual_low=low, residual_high=high, low=v_low, high=v_high, energy=floor)
 
@@ -160,6 +166,14 @@ def _in_plane(
     return _looked_at(_run_plane, patches, drifts, squares, place, counts, wanted, near, upper)
 
 
+def _straight(
+    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
+    counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
+) -> Extremes:
+    """The same of R without Q2, in two states."""
+    return _looked_at(partial(_run_plane, straight=True), patches, drifts, squares, place, counts, wanted, near, upper)
+
+
 def _looked_at(
     run: Callable[..., Array], patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
     counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
@@ -188,7 +202,7 @@ def sample_in_plane(
 
 def _run_plane(
     patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], parts: int, wanted: float,
+    counts: Sequence[int], parts: int, wanted: float, straight: bool = False,
 ) -> Array:
     """What the kernel finds with this many parts along each axis; samples alone for 0."""
     from certbound.values.continuous.kernel import extremes_in_plane
@@ -202,7 +216,7 @@ def _run_plane(
     extremes_in_plane(
         np.ascontiguousarray(patches.coefficients), patches.step, width_x, width_y, place,
         np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
-        (*time, *x, *y), changes, wanted, out,
+        (*time, *x, *y), changes, wanted, straight, out,
     )  # fmt: skip
     return out
 
@@ -271,6 +285,13 @@ def coarse_size(
             if a.any():
                 total = total + 0.5 * a[place] * (_bent(patches, i, j) + steep[i] * steep[j])
     return np.asarray(total * (1 + 1e-12))
+
+
+def _most_energy(patches: Patches, squares: Interpolant, place: Index, n: int) -> Array:
+    """An upper bound of Q2 over each patch from the sizes of its terms."""
+    steep, size = [_steepest(patches, i) for i in range(n)], squares.size + squares.remainder
+    parts = [0.5 * size[i * n + j, place] * steep[i] * steep[j] for i in range(n) for j in range(n)]
+    return np.asarray(np.sum(parts, axis=0) * (1 + 1e-12))
 
 
 def value_range(patches: Patches) -> tuple[Array, Array]:

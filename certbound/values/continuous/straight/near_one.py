@@ -22,6 +22,7 @@ from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import (
     NEGLIGIBLE,
     Model,
+    Proof,
     covers,
     extreme_over,
     proved_lower,
@@ -34,7 +35,7 @@ from certbound.values.continuous.plane import Found, Plane, Source, held_plane, 
 from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
-from certbound.values.continuous.straight.relative import relative_below
+from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
 
@@ -51,9 +52,13 @@ _SHARE = 0.58  # of what may be spent, for the finer grid
 _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noises: lower bounds need more
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
-_GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0)  # both where failing is rare
-_BELOW = 0.43  # of what may be spent, for a lower bound then
+_GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0, 2.0)  # both where failing is rare
+_ABOVE, _BELOW = 0.82, 1.05  # of what may be spent, for each bound then
+_RARELY = 0.0065  # about the seconds of one of them, over cells^2
+_FAR = 1.0  # of log P above a rough guess: logarithms may do better
 _FINE = 30  # cells along each state, without which nothing comes of it
+_LONG = {True: 0.02, False: 0.012}  # a ramp's share of the horizon then: fronts start as wide as cells
+_NEARLY = 0.06  # of log P: what is left to pay is no more
 _SPARED = 0.03  # of U, which need not be carried then
 _VAIN = 0.1  # of the cost, of a proposal that is not proved
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
@@ -64,7 +69,9 @@ _LIKELY = 0.15  # of log P: as near to a rough guess nothing is wrong
 _ENOUGH = 0.25  # and nothing else is tried
 
 
-def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wanted: float) -> Found:
+def bound_plane(
+    problem: Problem, model: Model, room: Room, deadline: float, wanted: float, *, above: bool = True
+) -> Found:
     """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
     inner = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     outer = replace(inner, low=_pair(room.outer_low), high=_pair(room.outer_high))
@@ -74,21 +81,22 @@ def bound_plane(problem: Problem, model: Model, room: Room, deadline: float, wan
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
     if wanted < math.inf:
         check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
-    return bound_between(problem, model, inner, outer, deadline, wanted, other)
+    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above)
 
 
 def bound_between(
-    problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other
+    problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other,
+    *, looked: bool = True,
 ) -> Found:
     """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due."""
     granted = round(deadline - time.perf_counter(), 1)
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
     level = rough_level(inner)
     if not served or not _RARE < level < 0:
-        logs = other(time.perf_counter() + granted, wanted)
-        if not served or not _RAREST < level <= _RARE or outer is None or logs[0] <= wanted or wanted == math.inf:
-            return logs
-        return _with_rare(problem, model, outer, granted, level, logs)
+        rare = served and _RAREST < level <= _RARE and round(math.sqrt(_ABOVE * granted / _RARELY)) >= _FINE
+        if rare:
+            return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked)
+        return other(time.perf_counter() + granted, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below, hopes = list[Proposed](), list[Proposed](), list[float]()
     most = min(math.sqrt(_SHARE * granted / _COST), _MOST)
@@ -133,21 +141,35 @@ def bound_between(
 
 
 def _with_rare(
-    problem: Problem, model: Model, outer: Plane, granted: float, level: float, found: Found
+    problem: Problem, model: Model, boxes: tuple[Plane, Plane | None], granted: float, level: float, wanted: float,
+    other: Other, looked: bool,
 ) -> Found:
-    """The lower bound that may be had where failing is rare, beside what is ``found``."""
-    upper, lower, words, proposed = found
-    if lower is not None and upper - lower < _ENOUGH:
-        return found
-    cells, shares = round(math.sqrt(_BELOW * granted / _COST)), list[float]()
-    if cells < _FINE:
-        return found
+    """Both bounds where failing is rare: by logarithms, which certificates state, where these may do for ``wanted``.
+
+    Then shares of U are paid, first from above if that is ``looked`` for, and logarithms serve where that fails.
+    """
+    inner, outer = boxes
+    cells = [round(math.sqrt(share * granted / _RARELY)) for share in (_ABOVE, _BELOW)]
+    upper, least, words = 0.0, None, "value function in two states, cells: "
+    proposed = list[Proposed](), list[Proposed]()
+    if looked and wanted >= level - _LIKELY:
+        upper, least, words, proposed = other(time.perf_counter() + granted, math.inf)
+        if upper <= wanted:
+            return upper, least, words, proposed
+        words += ", "
     with contextlib.suppress(OutOfTime):
-        _bounded(outer, model, cells, level, points_of(problem), below=True, shares=shares)
-    best = max(shares, default=-math.inf)
-    if best <= (-math.inf if lower is None else lower):
-        return found
-    return upper, best, f"{words}, {cells}^2 below", proposed
+        if looked:
+            found = rarely(inner, model, cells[0], level, None, below=False)
+            upper, words = min(upper, 0.0 if found is None else found), f"{words}{cells[0]}^2"
+        if upper > wanted and outer is not None and wanted < math.inf:
+            least = rarely(outer, model, cells[1], level, points_of(problem), below=True)
+            words += f", {cells[1]}^2 below"
+    done = not looked or upper <= wanted or upper < level + _FAR
+    if done and (least is not None or upper <= wanted or outer is None or wanted == math.inf):
+        return upper, least, words, proposed
+    logs = other(time.perf_counter() + granted, wanted)
+    least = max((one for one in (least, logs[1]) if one is not None), default=None)
+    return min(upper, logs[0]), least, f"{words} and {logs[2].rpartition('cells: ')[2]}", logs[3]
 
 
 def _pair(ends: tuple[float, ...]) -> tuple[float, float]:
@@ -156,19 +178,65 @@ def _pair(ends: tuple[float, ...]) -> tuple[float, float]:
 
 def _bounded(
     plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool,
-    shares: list[float] | None = None, hopes: list[float] | None = None,
+    hopes: list[float] | None = None,
 ) -> Proposed | None:
     """The best bound of a few proposals: corrected by samples of the residual, then by its bounds.
 
-    ``shares`` gets the bounds of log P by `relative_below` (lower ones only), which no certificate states; ``hopes``
-    what each kind of proposal promised.
+    ``hopes`` gets what each kind of proposal promised.
     """
-    rare = shares is not None
-    starts, kinds = plane.starts, list[tuple[float, float, Ramps, Surface, Source | None]]()
+    starts = plane.starts
+    chosen = _chosen(plane, model, cells, level, points, below=below, hopes=hopes)
+    if chosen is None:
+        return None
+    value, solver, surface, source = chosen
+    best: Proposed | None = None
+    for factor in (*_AGAIN, None):
+        spare = NEGLIGIBLE * SMALL * value
+        payment: Payment | None
+        if below:
+            payment, proof = proved_lower(surface, model, starts, points, spare, plane.cut)
+        else:
+            payment, proof = proved_upper(surface, model, starts, (), spare)
+        if payment is not None and (best is None or (payment.log - best[1].log) * (1 if below else -1) > 0):
+            best = surface if below else raised_above(surface), payment
+        table = _needed(proof, surface, SMALL, below=below)
+        if factor is None or table is None or table.max(axis=(1, 2)) @ surface.steps < _LEFT * value:
+            break
+        source = _more(source, surface, factor * table)
+        surface = solver.surface(source, below=below)
+    return best
+
+
+def rarely(
+    plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool
+) -> float | None:
+    """The best bound of log P that pays shares of U (`relative`), which no certificate states; None where none is."""
+    chosen, best = _chosen(plane, model, cells, level, points, below=below, rare=True), list[float]()
+    if chosen is None:
+        return None
+    value, solver, surface, source = chosen
+    for factor in (*_GENTLY[1], None):
+        spare, left = NEGLIGIBLE * solver.small * value, _SPARED / plane.horizon * _least(surface, solver.small)
+        given = surface, model, plane.starts, spare, solver.small * left
+        proof = seen_below(*given, points, plane.cut) if below else seen_above(*given)
+        share = relative_below(proof) if below else relative_above(proof)
+        best += [] if share is None else [share]
+        table = _needed(proof, surface, solver.small, below=below)
+        if factor is None or table is None or (best and abs(best[-1] - math.log(value)) < _NEARLY):
+            break
+        source = _more(source, surface, factor * np.maximum(table - left, 0.0))
+        surface = solver.surface(source, below=below)
+    return (max if below else min)(best, default=None)
+
+
+def _chosen(
+    plane: Plane, model: Model, cells: int, level: float, points: Array | None, *, below: bool, rare: bool = False,
+    hopes: list[float] | None = None,
+) -> tuple[float, Ramps, Surface, Source | None] | None:
+    """U at the starts, the solver, the proposal and the source that promise most."""
+    kinds, lead = list[tuple[float, float, Ramps, Surface, Source | None]](), _LONG[below] if rare else ramp_of(cells)
     for eased in (False, True):
-        solver = Ramps(
-            plane, cells, ramp_of(cells) * plane.horizon, _MARGIN[below], eased=eased, below=below, finely=rare
-        )
+        solver = Ramps(plane, cells, lead * plane.horizon, _MARGIN[below], eased=eased, below=below, finely=rare)
         if eased and solver.plain:  # the same again
             break
         surface, source, value, promised = _corrected(solver, model, points, below, rare)
@@ -176,60 +244,42 @@ def _bounded(
             hopes.append(promised)
         if surface is not None and 0 < value < 1 and abs(promised - value) < _MUCH * value:
             kinds.append((promised, value, solver, surface, source))
-            if promised > 0 and abs(math.log(promised) - level) < _LIKELY:
+            if rare or (promised > 0 and abs(math.log(promised) - level) < _LIKELY):
                 break
-    if not kinds:
+    return (max if below else min)(kinds, key=lambda one: one[0])[1:] if kinds else None
+
+
+def _needed(proof: Proof, surface: Surface, small: float, *, below: bool) -> Array | None:
+    """What a proof found missing, of U; None where it has no bound of it."""
+    ranges = proof.ranges
+    needed = -ranges.residual_low if below else np.where(ranges.low < 0, ranges.residual_high, 0.0)
+    if not np.isfinite(needed).all():
         return None
-    _, value, solver, surface, source = (max if below else min)(kinds, key=lambda one: one[0])
-    best: Proposed | None = None
-    for factor in (*(_GENTLY[1] if rare else _AGAIN), None):
-        spare = NEGLIGIBLE * SMALL * value
-        payment: Payment | None
-        near = SMALL * _SPARED / plane.horizon * _least(surface) if rare else None
-        if below:
-            payment, proof = proved_lower(surface, model, starts, points, spare, plane.cut, near)
-            needed = -proof.ranges.residual_low
-        else:
-            payment, proof = proved_upper(surface, model, starts, (), spare)
-            needed = np.where(proof.ranges.low < 0, proof.ranges.residual_high, 0.0)
-        if shares is not None and (share := relative_below(proof)) is not None:
-            shares.append(share)
-        if payment is not None and (best is None or (payment.log - best[1].log) * (1 if below else -1) > 0):
-            best = surface if below else raised_above(surface), payment
-        if factor is None or not np.isfinite(needed).all():
-            break
-        table = np.zeros((surface.slabs, surface.cells[0] * surface.cells[1]))
-        table[proof.slab, proof.cell] = np.maximum(needed, 0.0) / SMALL
-        table = table.reshape(surface.slabs, *surface.cells)
-        if rare:
-            table = np.maximum(table - _SPARED / plane.horizon * _least(surface), 0.0)
-        if table.max(axis=(1, 2)) @ surface.steps < _LEFT * value:
-            break
-        source = _more(source, surface, factor * table)
-        surface = solver.surface(source, below=below)
-    return best
+    table = np.zeros((surface.slabs, surface.cells[0] * surface.cells[1]))
+    table[proof.slab, proof.cell] = np.maximum(needed, 0.0) / small
+    return table.reshape(surface.slabs, *surface.cells)
 
 
 def _corrected(
     solver: Ramps, model: Model, points: Array | None, below: bool, rare: bool = False
 ) -> tuple[Surface | None, Source | None, float, float]:
     """The proposal that promises most, its source, U at the starts and about the bound."""
-    plane, source = solver.plane, None
+    plane, source, small = solver.plane, None, solver.small
     best: tuple[Surface | None, Source | None, float, float] = None, None, 0.0, math.inf
     sign, least = -1 if below else 1, math.inf
     for factor in (*(_GENTLY[0] if rare else _FACTORS), None):
         surface = solver.surface(source, below=below)
         if not covers(surface, plane.horizon, plane.low, plane.high, within=not below):
             break
-        value = 1 + extreme_over(surface, plane.starts, upper=not below, points=points) / SMALL
+        value = 1 + extreme_over(surface, plane.starts, upper=not below, points=points) / small
         excess, level = sampled_residual(surface, model, upper=not below, along=6)
-        asked = level > -SMALL if below else level < 0  # where 0 < U < 1
-        needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / SMALL
+        asked = level > -small if below else level < 0  # where 0 < U < 1
+        needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / small
         paid = float(needed.max(axis=(1, 2)) @ surface.steps)
         if rare:  # as a share of U and what it is at the starts
-            share = needed / (_least(surface) + value)
+            share = needed / (_least(surface, small) + value)
             paid = min(paid, 2 * value * float(share.max(axis=(1, 2)) @ surface.steps))
-            needed = np.maximum(needed - _SPARED / plane.horizon * _least(surface), 0.0)
+            needed = np.maximum(needed - _SPARED / plane.horizon * _least(surface, small), 0.0)
         if not math.isfinite(paid) or value <= 0:
             break
         if best[0] is None or sign * (value - best[3]) + paid < 0:
@@ -246,7 +296,7 @@ def _more(source: Source | None, surface: Surface, needed: Array) -> Source:
     return more if source is None else source.plus(more)
 
 
-def _least(surface: Surface) -> Array:
+def _least(surface: Surface, small: float) -> Array:
     """The least U of each patch, 0 where it is less."""
     low = [value_range(surface.patches(*chunk))[0] for chunk in surface.chunks()]
-    return np.maximum(1 + np.concatenate(low) / SMALL, 0.0).reshape(surface.slabs, *surface.cells)
+    return np.maximum(1 + np.concatenate(low) / small, 0.0).reshape(surface.slabs, *surface.cells)

@@ -45,12 +45,14 @@ Solve = Callable[[Array], Array]
 SHIFT = 2.5
 SMALL = 2.0**-8
 """e of V = e (U - 1)."""
+_SMALLER = 2.0**-16  # where failing is rare: Q2 is next to nothing then, and left out
 _LEAD = 6.0  # over cells^2: a ramp's share of the horizon
 _RATE = 8.0  # of 1 - U on faces: at tau = x ramps, times x^2 / (1 + x^3) over a ramp
 _GROWTH = 0.5  # a step over tau, at most
 _FIRST = 0.2  # of a ramp, the first step
 _LONGEST = 8  # steps of the horizon, at least
-_FINELY = 24  # the same where failing is rare
+_FINELY, _SLOWLY = 24, 0.2  # both where failing is rare
+_SOONER = 2.0  # ramps that U starts before T then
 _CLOSELY = 0.25  # correlated: a wider box
 _PAST = 0.05  # d: how far beyond 0 and 1 U is where it is given up
 _ZONE = 6  # cells at a face where the drift back is weakened
@@ -84,6 +86,8 @@ class Ramps:
         finely: bool = False,
     ) -> None:
         self.plane, self.lead, self.longest = plane, lead, _FINELY if finely else _LONGEST
+        self.small, self.growth = (_SMALLER, _SLOWLY) if finely else (SMALL, _GROWTH)
+        self.shift = _SOONER if finely else self.shift
         nodes = [self.grid(axis, Plan(cells=cells, growth=_GROWTH, lead=lead)) for axis in (0, 1)]
         shared = _correlation(plane, nodes)
         wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
@@ -163,7 +167,7 @@ class Ramps:
     def surface(self, source: Source | None, *, below: bool) -> Surface:
         """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
         horizon, shift = self.plane.horizon, 0.0 if below else self.shift * self.lead
-        times, first = _times(horizon, shift, self.lead, self.longest)
+        times, first = _times(horizon, shift, self.lead, (self.longest, self.growth))
         sign = -1.0 if below else 1.0
         given = None if source is None else sign * self.fed(source)
         value = self.first
@@ -240,10 +244,10 @@ class Ramps:
     def scaled(self, whole: Surface, below: bool) -> Surface:
         """V = e (U - 1) from U itself."""
         # U may rise over 1 beside corners
-        scale = SMALL / (max(1.0, top_of(whole)) if below else max(self.least(whole), 0.5))
+        scale = self.small / (max(1.0, top_of(whole)) if below else max(self.least(whole), 0.5))
         return replace(
             whole, values=scale * whole.values, start_rates=scale * whole.start_rates, end_rates=scale * whole.end_rates
-        ).raised(-SMALL)
+        ).raised(-self.small)
 
 
 def ramp_of(cells: int) -> float:
@@ -284,11 +288,11 @@ def _at(times: Array, values: Array, t: float) -> Array:
     return np.asarray((1 - share) * values[left] + share * values[left + 1]).ravel()
 
 
-def _times(horizon: float, shift: float, lead: float, longest: int) -> tuple[Array, int]:
+def _times(horizon: float, shift: float, lead: float, longest: tuple[int, float]) -> tuple[Array, int]:
     """Ends of the steps, one of them at ``shift`` and the last one at shift + horizon, and the first one's number."""
     step, steps = _FIRST * lead, [_FIRST * lead]
     while sum(steps) < horizon + shift:
-        while 2 * step <= min(_GROWTH * (sum(steps) + 2 * _FIRST * lead), horizon / longest):
+        while 2 * step <= min(longest[1] * (sum(steps) + 2 * _FIRST * lead), horizon / longest[0]):
             step *= 2
         steps.append(step)
     times = np.concatenate([[0.0], np.cumsum(steps)])
