@@ -44,7 +44,7 @@ from certbound.values.semilagrangian.confines import Ends
 _UP = 1 + 1e-9
 _FALLS = np.concatenate([0.95 ** np.arange(1, 64), 0.035 * 0.7 ** np.arange(1, 40), 2e-8 * 0.3 ** np.arange(1, 50)])
 _PIECES = 800
-_WIDE = (2.3, 2.5, 2.7, 3.0, 3.3, 3.8, 4.4, 6.0, math.inf)
+_WIDE = (2.5, 3.0, 3.8, 6.0, math.inf)
 _GRADES = 12
 
 
