@@ -5,7 +5,7 @@ places of such ends, and u counts 1. With M_0 = 1 and M_k falling, sum_k (M_{k-1
 that u >= E L + sum_k (M_{k-1} - M_k) P(meets it, Z_h > z_k).
 
 Tolls fall by a part over a cell. They are asked of parts of cells, nodes pay what the parts around them ask, which is
-bilinear in between, and a cell pays besides what that lacks on one of its parts: there the least is that of its corners.
+bilinear in between, and a cell pays besides what that lacks on one of its parts, where it is least at a corner.
 """
 
 from __future__ import annotations
