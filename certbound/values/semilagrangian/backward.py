@@ -38,6 +38,8 @@ class Bounds:
         Whether this is about -L.
     paid : ndarray, shape (ny - 1, nq - 1), or 0
         What every cell pays besides in a step.
+    nodal : ndarray, shape (ny, nq), or 0
+        What is paid besides at nodes, and bilinear in between.
     catches : sequence of Catch
         What cells are paid (-L).
     """
@@ -49,6 +51,7 @@ class Bounds:
     mirrors: Sequence[Mirror] = ()
     below: bool = False
     paid: Array | float = 0.0
+    nodal: Array | float = 0.0
     catches: Sequence[Catch] = ()
 
 
@@ -72,7 +75,7 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
     owed = [catch.owed(value.nodal, value.bend, np.diff(frame.q)) for catch in bounds.catches]
     if owed:
         payment = payment - np.maximum.reduce(owed)
-    return limited(frame, bounds, nodal + around_nodes(payment, largest=True), bend)
+    return limited(frame, bounds, nodal + bounds.nodal + around_nodes(payment, largest=True), bend)
 
 
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:

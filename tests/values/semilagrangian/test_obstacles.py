@@ -50,8 +50,8 @@ def test_one_step_counts_who_meets_an_obstacle_and_ends_beside_it() -> None:
         ratios.append(found / seen)
         caught.append(max(catch.chance[0, i, j] for catch in layout.below.catches))
         assert caught[-1] <= seen + 4 * math.sqrt(seen * (1 - seen) / count)
-    assert max(ratios) < 4  # 2 is what walls of other shapes count at least, all around
-    assert np.median(ratios) < 2.5
+    assert max(ratios) < 2.8  # 2 is what walls of other shapes count at least, all around
+    assert np.median(ratios) < 1.9  # half a cell more on either side: 2.1
     assert max(caught) > 0.05
 
 

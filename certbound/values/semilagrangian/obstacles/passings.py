@@ -12,7 +12,8 @@ room.
 
 *The first*: Z is at least the solution Y of dY = (push - pull Y) dt + s dW, Y_0 the least Z of the starts, since Z' is
 at least that on the tube. Y_t is normal. From y > 0 on, Y meets 0 with a probability of at most c(y) (`meeting`), which
-falls: its mean is at most the sum of c's falls at y_1 < y_2 < ... times P(Y_t < y_i), with c = 1 up to 0.
+falls: its mean is at most the sum of c's falls at y_1 < y_2 < ... times P(Y_t < y_i), with c = 1 up to 0. Only h - t is
+left to do so: c is that of the next larger one of h, h/sqrt(2), h/2, ...
 
 The drift at the end is that for the start's p, and changes at a rate within ``turn``: where that gives a larger mean of
 Y, it is taken (`least_mean`).
@@ -34,15 +35,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
+from certbound.lazy import compiled
 from certbound.problem.model import Tape, jacobian
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete import evaluate
 from certbound.values.semilagrangian.confines import Ends
 
 _UP = 1 + 1e-9
-_FALLS = np.concatenate([0.92 ** np.arange(1, 40), 0.035 * 0.7 ** np.arange(1, 40), 2e-8 * 0.3 ** np.arange(1, 50)])
+_FALLS = np.concatenate([0.95 ** np.arange(1, 64), 0.035 * 0.7 ** np.arange(1, 40), 2e-8 * 0.3 ** np.arange(1, 50)])
 _PIECES = 800
-_WIDE = (2.7, 3.3, 4.4, 6.0, math.inf)
+_WIDE = (2.5, 3.0, 3.8, 6.0, math.inf)
+_GRADES = 12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -167,8 +170,8 @@ def passed(
     s, step : float
     """
     push, pull = float(found.push[k]), float(found.pull[k])
-    y, chance = meeting(push, pull, float(found.top[k]), s, step)
-    falls, best = -np.diff(chance, prepend=1.0), np.ones(len(low))
+    best: Array = np.ones(len(low))
+    tables: dict[int, tuple[Array, Array]] = {}
     within = beyond = np.zeros(len(low))
     if found.stays[k]:
         within, beyond = -ends.hi, -(found.depth + ends.lo)
@@ -180,10 +183,35 @@ def passed(
         mean = np.maximum(low * np.exp(-pull * t) + push * whole(pull, t), least_mean(found, k, low, drift, t))
         mean -= 1e-12 * (np.abs(low) + abs(push) * step)
         root = np.maximum(s * np.sqrt(whole(2 * pull, t)), 1e-300)
-        met = (at_most((y - mean[:, None]) / root[:, None]) @ falls + chance[-1]) * _UP
+        met, left = np.zeros(len(low)), step / np.maximum(step - t, 1e-300)
+        grade = np.minimum(np.floor(2 * np.log2(left)), _GRADES).astype(int)
+        for j in np.unique(grade[late <= step]).tolist():
+            if j not in tables:
+                tables[j] = meeting(push, pull, float(found.top[k]), s, step * 2 ** (-j / 2) * _UP)
+            here = np.flatnonzero(grade == j)
+            met[here] = _mean_of(*tables[j], mean[here], root[here]) * _UP
         met = np.where(late > step, 0.0, np.maximum(met - within, 0.0) + beyond)
         best = np.minimum(best, met + float(at_most(np.array(-wide))))
     return best
+
+
+@compiled
+def _mean_of(y: Array, chance: Array, mean: Array, root: Array) -> Array:
+    """The mean of the step function that falls from 1 to ``chance`` at ``y`` (and never below the last of them)."""
+    found = np.empty(len(mean))
+    for n in range(len(mean)):
+        total, before = 0.0, 1.0
+        for i in range(len(y)):
+            z = (y[i] - mean[n]) / root[n]
+            if z > 9.0:
+                total += before
+                before = 0.0
+                break
+            if z > -38.0:
+                total += (before - chance[i]) * 0.5 * math.erfc(-z / math.sqrt(2.0))
+            before = chance[i]
+        found[n] = (total + before) * (1 + 1e-9) + 1e-300
+    return found
 
 
 def least_mean(found: Passing, k: int, low: Array, drift: Array, t: Array) -> Array:

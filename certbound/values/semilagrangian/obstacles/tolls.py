@@ -3,6 +3,9 @@
 From below they are paid: of who meets it and ends at a height Z_h > z_k above it L counts at most M_k, the most in all
 places of such ends, and u counts 1. With M_0 = 1 and M_k falling, sum_k (M_{k-1} - M_k) 1{Z_h > z_k} <= 1 - L there, so
 that u >= E L + sum_k (M_{k-1} - M_k) P(meets it, Z_h > z_k).
+
+Tolls fall by a part over a cell. They are asked of parts of cells, nodes pay what the parts around them ask, which is
+bilinear in between, and a cell pays besides what that lacks on one of its parts, where it is least at a corner.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.rigor.intervals import Interval
+from certbound.rigor.intervals import Interval, concatenate
 from certbound.values.discrete import evaluate
 from certbound.values.grids import over_corners
 from certbound.values.semilagrangian.bands import Frame
@@ -37,6 +40,8 @@ class Way:
     paid: Mask
 
 
+_PARTS = (2, 4)  # of a cell, along y and q, from which tolls are asked
+_SIDES = ((0, 0), (0, 1), (1, 0), (1, 1))
 _ABOVE = np.array([0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
 
 
@@ -105,13 +110,22 @@ def _cells(frame: Frame, starts: tuple[Index, Index], i: int, j: int) -> tuple[I
 
 
 def _starts_in(
-    setting: Setting, clock: Clock, frame: Frame, rows: Index, columns: Index
+    setting: Setting, clock: Clock, frame: Frame, rows: Index, columns: Index, part: tuple[int, ...] | None = None
 ) -> tuple[Interval, Interval, Interval]:
-    """p, q and F on cells."""
-    q = Interval(frame.q[columns], frame.q[columns + 1])
-    p = Interval(frame.y[rows], frame.y[rows + 1]) + q * clock.shear
+    """p, q and F on cells, or on one of their parts."""
+    y, q = Interval(frame.y[rows], frame.y[rows + 1]), Interval(frame.q[columns], frame.q[columns + 1])
+    if part is not None:
+        y, q = (_part(ends, place, count) for ends, place, count in zip((y, q), part, _PARTS))
+    p = y + q * clock.shear
     f, bad, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(rows))), p, q])
     return p, q, Interval(np.where(bad, -np.inf, f.lo[:, 0]), np.where(bad, np.inf, f.hi[:, 0]))
+
+
+def _part(ends: Interval, place: int, count: int) -> Interval:
+    """One of ``count`` parts, which cover it."""
+    width = ends.hi - ends.lo
+    low, high = (np.clip(ends.lo + width * (k / count), ends.lo, ends.hi) for k in (place, place + 1))
+    return Interval(low, ends.hi if place + 1 == count else high)
 
 
 def _drift(setting: Setting, found: Passing, p: Interval) -> Interval:
@@ -145,23 +159,31 @@ def ways_past(
 
 def tolls_of(
     setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
-) -> Array:
-    """What cells pay, shape (ny - 1, nq - 1). ``starts``: the blocks' first cells, and the number of cells."""
-    total = np.zeros(frame.live.shape)
+) -> tuple[Array, Array]:
+    """What nodes pay (bilinear in between), shape (ny, nq), and cells besides, shape (ny - 1, nq - 1).
+
+    ``starts``: the blocks' first cells, and the number of cells.
+    """
+    total = np.zeros((*_PARTS, *frame.live.shape))
     s = setting.noise * (1 + setting.spread)
     bent = frame.bends[1] * np.diff(frame.y)[:, None] ** 2 + frame.bends[3] * np.diff(frame.q) ** 2
     bent = bent / 8 * (1 + 1e-9) + 1e-14
-    low = over_corners(np.minimum, frame.image[1] - frame.radius[1]) - bent
-    high = over_corners(np.maximum, frame.image[1] + frame.radius[1]) + bent
+    bent = bent + over_corners(np.maximum, frame.radius[1]) + 1e-13 * over_corners(np.maximum, np.abs(frame.image[1]))
     for ways in every:
         for i, j in np.argwhere(np.any([way.paid for way in ways], axis=0)) if ways else ():
             rows, columns = _cells(frame, starts, i, j)
             if not len(rows):
                 continue
-            p, q, rates = _starts_in(setting, clock, frame, rows, columns)
-            most = float(blocks.strays.most[1][i, j])
-            image = Interval(low[rows, columns] - most, high[rows, columns] + most)
-            due = np.ones(len(rows))
+            most = np.tile(float(blocks.strays.most[1][i, j]) + bent[rows, columns], math.prod(_PARTS))
+            every_part = list(np.ndindex(*_PARTS))
+            each = [_starts_in(setting, clock, frame, rows, columns, part) for part in every_part]
+            p, q, rates = (concatenate(list(values)) for values in zip(*each))
+            corners = np.stack([
+                np.concatenate([_between(frame.image[1], rows, columns, part, side) for part in every_part])
+                for side in _SIDES
+            ])  # fmt: skip
+            image = Interval(corners.min(axis=0) - most, corners.max(axis=0) + most)
+            due = np.ones(len(p))
             ends = ways[0].ends
             away = np.nextafter(p.lo - ends[1], -np.inf), np.nextafter(ends[0] - p.hi, -np.inf)
             for way in ways:
@@ -172,5 +194,26 @@ def tolls_of(
                         _drift(setting, way.found, p).lo, away, rates, (image - end) * sign,
                         blocks.covariance[2][i, j], s, clock.step,
                     ))  # fmt: skip
-            total[rows, columns] += due
-    return total
+            total[:, :, rows, columns] += due.reshape(*_PARTS, len(rows))
+    return _shared(total)
+
+
+def _between(table: Array, rows: Index, columns: Index, part: tuple[int, ...], side: tuple[int, int]) -> Array:
+    """A bilinear function, given at nodes, at a corner of one of the parts of cells."""
+    t, r = ((part[k] + side[k]) / _PARTS[k] for k in (0, 1))
+    low, high = ((1 - r) * table[rows + k, columns] + r * table[rows + k, columns + 1] for k in (0, 1))
+    return np.asarray((1 - t) * low + t * high)
+
+
+def _shared(due: Array) -> tuple[Array, Array]:
+    """Payments at nodes, the most of the parts of cells there, and what cells lack with them; ``due`` by parts."""
+    nodal = np.zeros((due.shape[2] + 1, due.shape[3] + 1))
+    for a, b in _SIDES:
+        place = slice(a, due.shape[2] + a), slice(b, due.shape[3] + b)
+        nodal[place] = np.maximum(nodal[place], due[-a, -b])
+    lacks = np.zeros(due.shape[2:])
+    rows, columns = np.nonzero(due.max(axis=(0, 1)) > 0)
+    for part in np.ndindex(*_PARTS):
+        least = np.min([_between(nodal, rows, columns, part, side) for side in _SIDES], axis=0)
+        lacks[rows, columns] = np.maximum(lacks[rows, columns], due[(*part, rows, columns)] - least * (1 - 1e-12))
+    return nodal, lacks
