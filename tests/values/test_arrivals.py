@@ -114,6 +114,6 @@ def test_where_the_domain_counts_as_a_limit_there_is_no_lower_bound() -> None:
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.5 * np.eye(2))
     safe, domain = [cb.Inside(cb.Box([-1, -1], [1, 1]))], cb.Box([-2, -2], [0.9, 2])
     problem = cb.Problem(system, initial=[0, 0], safe=safe, horizon=1.0, domain=domain, leaving="ends")
-    with patch.object(straight, "bound_plane", lambda *_: (-1.0, -2.0, "", ((), ()))):
+    with patch.object(straight, "bound_plane", lambda *_, **__: (-1.0, -2.0, "", ((), ()))):
         assert bound_exits(problem).lower is None
         assert bound_exits(problem.replace(leaving="unsafe")).lower is not None
