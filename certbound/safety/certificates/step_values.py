@@ -44,6 +44,7 @@ _BEYOND = 1000.0  # lengths of a side for which it does where these are not know
 _LOOKED = 2000  # parts of an axis in which a jump is looked for
 _NARROW = 1e-6  # half of a cell at a jump, of the length of an axis: with less the checker loses digits
 _SLIVER = 1e-6  # of the length of an axis
+_MOST_LOOKS = 5e7  # cells, times pieces of the noise, times steps, in two states: about a minute of the checker
 _MOST_STEPS = 2000  # that the checker looks at
 _MORE = 1.25  # times the steps after which the engine's bounds were close
 
@@ -143,11 +144,13 @@ def _grids(problem: Problem, effort: int, steps: int) -> tuple[list[Grid], int]:
             raise CertificateError(str(error)) from error
     side = _SIDES[n][effort]
     try:
-        return [chain_grid(problem.replace(horizon=steps) if problem.endless else problem, side)] * (steps + 1), (
-            max(2 * int(_PIECES[entries] * side / 2), 24)
-        )
+        grid = chain_grid(problem.replace(horizon=steps) if problem.endless else problem, side)
     except InfeasibleError as error:
         raise CertificateError(str(error)) from error
+    pieces = max(2 * int(_PIECES[entries] * side / 2), 24)
+    if n == 2 and math.prod(grid.shape) * pieces**entries * steps > _MOST_LOOKS:
+        raise CertificateError("the checker would look at a grid as fine as this bound needs for more than a minute.")
+    return [grid] * (steps + 1), pieces
 
 
 def _parts(problem: Problem, most: int) -> int:

@@ -187,7 +187,8 @@ class _Chain:
         low, high = np.quantile(np.concatenate(seen), [_RARE, 1 - _RARE], axis=0)
         low, high = np.minimum(low, hull.lo), np.maximum(high, hull.hi)
         low, high = np.where(np.isinf(self.low), low, self.low), np.where(np.isinf(self.high), high, self.high)
-        least = 1e-3 * (1 + np.abs(low))
+        size = np.maximum(np.abs(low), np.abs(high))
+        least = 1e-3 * np.where(size > 0, size, 1.0)
         return np.where(high - low < least, low - least, low), np.where(high - low < least, high + least, high)
 
     def grid(self, side: int) -> Grid:
