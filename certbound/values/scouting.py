@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,15 +53,15 @@ class Scouted:
 
 
 def scouted(
-    drift: Callable[[Array, Array], Array], noise: float, faces: tuple[tuple[float, float], tuple[float, float]],
-    starts: Array, horizon: float, steps: int, broken: Callable[[Array, Array], Mask],
+    drift: Callable[[float, Array, Array], Array], noise: float, faces: tuple[tuple[float, float], tuple[float, float]],
+    starts: Array, horizon: float, steps: int, broken: Callable[[Array, Array], Mask], *, timed: bool = False,
 ) -> Scouted | None:  # fmt: skip
     """Follow dp = F dt, dq = g dt + s dW; None where nothing fails or all does, or the drift is undefined.
 
     Parameters
     ----------
     drift : callable
-        (F, g) at points, shape (2, N).
+        (F, g) at a time and points, shape (2, N).
     noise : float
         s.
     faces : pair of ends
@@ -69,16 +70,22 @@ def scouted(
         Each counts alike.
     broken : callable
         Which points of the box fail.
+    timed : bool
+        Whether the drift changes with time.
     """
     axes = [np.linspace(*ends, count) for ends, count in zip(faces, _NODES)]
     p, q = (part.ravel() for part in np.meshgrid(*axes, indexing="ij"))
     length = horizon / steps
     fails = broken(p, q)
-    step, lost = _chain(drift, noise, axes, (p, q), length)
-    if step is None:
-        return None
+    chains = []
+    for k in range(steps if timed else 1):
+        step, lost = _chain(partial(drift, (k + 0.5) * length), noise, axes, (p, q), length)
+        if step is None:
+            return None
+        chains.append((step, lost))
     values = [np.where(fails, 1.0, 0.0)]
-    for _ in range(steps):
+    for k in reversed(range(steps)):
+        step, lost = chains[k % len(chains)]
         values.append(np.where(fails, 1.0, step @ values[-1] + lost))
     index, weight = _placed(axes, starts[:, 0], starts[:, 1])
     first = (values[-1][index] * weight).sum(axis=1)
@@ -87,14 +94,14 @@ def scouted(
     mass = np.bincount(index.ravel(), (weight / first[:, None]).ravel() / len(starts), minlength=len(p))
     visits, steep_p, steep_q = np.zeros((3, len(p)))
     floor = _FLAT * first.min()
-    back = step.T.tocsr()
-    for value in values[::-1]:
+    back = [step.T.tocsr() for step, _ in chains]
+    for k, value in enumerate(values[::-1]):
         share = np.where(fails, 0.0, mass * value) * length
         slopes = np.gradient(np.log(np.maximum(value, floor)).reshape(_NODES), *axes)
         visits += share
         steep_p += share * slopes[0].ravel() ** 2
         steep_q += share * np.abs(slopes[1].ravel()) ** 3
-        mass = back @ np.where(fails, 0.0, mass)
+        mass = back[k % len(back)] @ np.where(fails, 0.0, mass)
     if not (steep_p.any() and steep_q.any()):
         return None
     cells = float(axes[0][1] - axes[0][0]), float(axes[1][1] - axes[1][0])

@@ -27,6 +27,7 @@ from certbound.watch import poll
 Box = list[Interval]
 
 _ROUNDS = 40
+_ONE = Interval.point(1.0)
 
 
 def series_along(tape: Tape, inputs: Sequence[Series], order: int, products: list[Series]) -> list[Series]:
@@ -137,8 +138,15 @@ class Flown:
     known: Mask
 
 
-def flow(tape: Tape, start: Sequence[Interval], step: float, order: int) -> Flown:
-    """Enclose x(step) for x' = tape(0, x) from every box of a batch; the tape must not depend on t.
+def during(begin: Interval, step: float) -> Interval:
+    """All times of a step that begins then."""
+    return begin + Interval(0.0, step)
+
+
+def flow(
+    tape: Tape, start: Sequence[Interval], step: float, order: int, begin: Interval = ZERO
+) -> Flown:
+    """Enclose x(step) for x' = tape(t, x) from every box of a batch.
 
     Parameters
     ----------
@@ -146,11 +154,12 @@ def flow(tape: Tape, start: Sequence[Interval], step: float, order: int) -> Flow
         One a state.
     order : int
         Of the Taylor polynomial.
+    begin : Interval
+        Times at which the step begins.
     """
-    way, known = _sweep(tape, start, step)
-    centre, piece = list(start), way
-    inner = _coefficients(tape, centre, order)
-    outer = _coefficients(tape, piece, order + 1)
+    way, known = reachable(tape, start, step, begin)
+    inner = _coefficients(tape, list(start), order, begin)
+    outer = _coefficients(tape, way, order + 1, during(begin, step))
     h = Interval.point(step)
     end = []
     for k in range(len(start)):
@@ -165,51 +174,49 @@ def flow(tape: Tape, start: Sequence[Interval], step: float, order: int) -> Flow
     return Flown(end=end, way=way, known=known)
 
 
-def _coefficients(tape: Tape, start: Sequence[Interval], order: int) -> list[Series]:
-    """x_0 ... x_order of the solution, from x_{k+1} = [f(x)]_k / (k + 1)."""
+def _coefficients(tape: Tape, start: Sequence[Interval], order: int, time: Interval) -> list[Series]:
+    """x_0 ... x_order of the solution, from x_{k+1} = [f(t, x)]_k / (k + 1)."""
     found: list[Series] = [[value] for value in start]
     products: list[Series] = []
     for k in range(order):
         poll("the flow over a step")
-        rates = series_along(tape, [[ZERO], *found], k, products)
+        rates = series_along(tape, [[time, _ONE][: k + 1], *found], k, products)
         for series, rate in zip(found, rates):
             coefficient = rate[k] if k < len(rate) else ZERO
             series.append((coefficient / float(k + 1)).broadcast_to(series[0].shape))
     return found
 
 
-def _sweep(tape: Tape, start: Sequence[Interval], step: float) -> tuple[Box, Mask]:
-    """A box B with start + [0, step] f(B) inside B holds the solutions up to the step (Picard)."""
-    span = Interval(0.0, step)
-    shape = start[0].shape
-    box = [value.broadcast_to(shape) for value in start]
-    known = np.zeros(shape, dtype=bool)
-    result = [Interval(value.lo.copy(), value.hi.copy()) for value in box]
+def reachable(tape: Tape, start: Sequence[Interval], step: float, begin: Interval = ZERO) -> tuple[Box, Mask]:
+    """Boxes that solutions from the starts do not leave up to the step, and where that was shown.
+
+    A box B with start + [0, step] f([begin, begin + step], B) inside B holds them (Picard).
+    """
+    span, time = Interval(0.0, step), during(begin, step)
+    first = [value.broadcast_to(start[0].shape) for value in start]
+    known = np.zeros(start[0].shape, dtype=bool)
+    result = [Interval(value.lo.copy(), value.hi.copy()) for value in first]
+    box, rest = first, np.arange(len(known))
     for _ in range(_ROUNDS):
         poll("the flow over a step")
-        rates, undefined, jumps = evaluate(tape, [Interval.point(np.zeros(shape)), *box])
-        finite = np.isfinite(rates.lo).all(axis=1) & np.isfinite(rates.hi).all(axis=1)
-        good = finite & ~undefined & ~jumps
+        rates, undefined, jumps = evaluate(tape, [time, *box])
+        good = np.isfinite(rates.mag).all(axis=1) & ~undefined & ~jumps
         new = []
-        for k, value in enumerate(start):
-            moved = value + span * Interval(np.where(good, rates.lo[:, k], 0.0), np.where(good, rates.hi[:, k], 0.0))
-            new.append(moved)
+        for k, value in enumerate(first):
+            rate = Interval(np.where(good, rates.lo[:, k], 0.0), np.where(good, rates.hi[:, k], 0.0))
+            new.append(value[rest] + span * rate)
         inside = good & np.all([(n.lo >= b.lo) & (n.hi <= b.hi) for n, b in zip(new, box)], axis=0)
-        fresh = inside & ~known
+        done, left = rest[inside], ~inside
         for k, value in enumerate(new):
-            result[k].lo[fresh], result[k].hi[fresh] = value.lo[fresh], value.hi[fresh]
-        known |= inside
-        if known.all():
+            result[k].lo[done], result[k].hi[done] = value.lo[inside], value.hi[inside]
+        known[done] = True
+        rest = rest[left]
+        if not len(rest):
             break
-        box = [_widened(value, good) for value in new]
+        box = [_widened(value[left], good[left]) for value in new]
     return result, known
 
 
 def _widened(value: Interval, good: Mask) -> Interval:
     more = np.where(good, 0.08 * (value.hi - value.lo) + 1e-12 * (1 + value.mag), 0.0)
     return Interval(value.lo - more, value.hi + more)
-
-
-def reachable(tape: Tape, start: Sequence[Interval], step: float) -> tuple[Box, Mask]:
-    """Boxes that solutions from the starts do not leave up to the step, and where that was shown."""
-    return _sweep(tape, start, step)

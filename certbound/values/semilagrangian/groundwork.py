@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
+from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
+from certbound.rigor.series import ZERO
 from certbound.values.discrete import evaluate
 from certbound.values.grids import Grid
 from certbound.values.scouting import Scouted
@@ -39,6 +43,10 @@ _ORDERS = (4, 8, 7)
 _MOST_BANDS = 12
 _APART = 0.02  # how far apart the variances of a band's cells may be
 _MOST_REACH = 6
+_TOGETHER, _ALIKE = 8, 0.45
+"""Steps that share all but the images of nodes, at most, and how far apart, in deviations of their noise, these are."""
+
+Images = tuple[Array, Array, Mask]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -52,8 +60,8 @@ class Layout:
     below: Bounds
 
 
-def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Layout:
-    """Prepare the steps.
+def layouts_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Iterator[Layout]:
+    """Prepare the steps, the last one first; of models that change with time a few at once.
 
     Raises
     ------
@@ -61,16 +69,48 @@ def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Lay
         The noise hardly reaches the other coordinate, so that steps along the flow have nothing to smooth with.
     """
     clock = _clock(setting, plan)
+    axes = axes_of(setting, clock, plan, _rough(setting, clock), scout)
+    if not setting.timed:
+        yield from _prepared(setting, clock, axes, [clock.begin]) * plan.count
+        return
+    begins = [Interval.point(clock.step) * float(k) for k in range(plan.count)]
+    size = together(setting, plan.count)
+    for last in range(plan.count, 0, -size):
+        part = begins[max(last - size, 0) : last]
+        yield from reversed(_prepared(setting, replace(clock, begin=_hull(part)), axes, part))
+
+
+def together(setting: Setting, count: int) -> int:
+    """How many of so many steps of a model that changes with time are prepared at once."""
+    step, model = setting.horizon / count, compile_numpy(setting.tape)
+    grid = [part.ravel() for part in np.meshgrid(*(np.linspace(*ends, 9) for ends in setting.faces))]
+    with np.errstate(all="ignore"):
+        rates = [np.broadcast_to(model(k * step, *grid), (grid[0].size, 2))[:, 1] for k in range(count)]
+    limit = _ALIKE * setting.noise / math.sqrt(step)
+    for size in range(min(_TOGETHER, count), 1, -1):
+        swings = np.ptp(sliding_window_view(np.array(rates), size, axis=0), axis=-1)
+        if np.nan_to_num(swings).max() <= limit:
+            return size
+    return 1
+
+
+def _hull(times: list[Interval]) -> Interval:
+    return Interval(float(times[0].lo), float(times[-1].hi))
+
+
+def _prepared(
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], begins: list[Interval]
+) -> list[Layout]:
+    """One layout for each of the steps' begins; ``clock.begin`` holds them all."""
     p, q = setting.faces
-    rough = _rough(setting, clock)
-    axes = axes_of(setting, clock, plan, rough, scout)
     index, edges = zip(*(_chunks(axis, count) for axis, count in zip(axes, _BLOCKS)))
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
     blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
     usable = blocks.known & _gentle(blocks, clock, axes)
     marked = _marked(setting, clock, axes, blocks, usable, (index[0], index[1]), (edges[0], edges[1]))
     live = ~marked.broken & marked.boxed & usable[np.ix_(*index)]
-    frame = _frame(setting, clock, axes, blocks, usable, (index[0], index[1]), live)
+    images = [_images(setting, replace(clock, begin=begin), *axes, live) for begin in begins]
+    frame = _frame(_around(images), clock, axes, blocks, usable, (index[0], index[1]), live)
     bands, live = _bands(frame, blocks, usable, (index[0], index[1]), (edges[0], edges[1]), clock)
     frame = replace(frame, live=live)
     reach = _reach(blocks, clock, usable, axes)
@@ -79,7 +119,7 @@ def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Lay
     everywhere = np.ones(level.shape, dtype=bool)
     known = setting, clock, frame, blocks, (_starts(index[0]), _starts(index[1])), marked.ways
     nodal, paid = tolls_of(*known)
-    return Layout(
+    layout = Layout(
         clock=clock, frame=frame, bands=bands,
         above=Bounds(
             level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above, paid=marked.bent + paid,
@@ -87,15 +127,16 @@ def layout_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Lay
         ),
         below=bounds_below(live, marked.broken, reach, below, catches_of(*known)),
     )  # fmt: skip
+    return [replace(layout, frame=replace(frame, image=image, radius=radius)) for image, radius, _ in images]
 
 
 def nodes_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> int:
-    """How many nodes the grid of a plan has, found at a fraction of the cost of `layout_of`.
+    """How many nodes the grid of a plan has, found at a fraction of the cost of `layouts_of`.
 
     Raises
     ------
     InfeasibleError
-        As for `layout_of`.
+        As for `layouts_of`.
     """
     clock = _clock(setting, plan)
     y, q = axes_of(setting, clock, plan, _rough(setting, clock), scout)
@@ -105,8 +146,9 @@ def nodes_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> int:
 def _clock(setting: Setting, plan: Plan) -> Clock:
     omega = level_of(plan.spare)
     step = setting.horizon / plan.count
+    whole = Interval(0.0, setting.horizon) if setting.timed else ZERO
     first = Clock(
-        step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega
+        step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega, begin=whole
     )
     blocks = _rough(setting, replace(first, shear=0.0))
     known = _some(blocks.known)
@@ -246,7 +288,7 @@ def _near_wall(
     meets = ~wall.safe(sizes, np.zeros((1, 1)))
     hit = tuple(index[meets] for index in hit)
     tube = tuple(part[meets] for part in tube)
-    f, undefined, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(tube[0]))), *tube])
+    f, undefined, _ = evaluate(setting.tape, [clock.times, *tube])
     low, high = np.where(undefined, -np.inf, f.lo.T), np.where(undefined, np.inf, f.hi.T)
     rates = Interval(low[0], high[0]), Interval(low[1], high[1])
     margins = wall.margins((tube[0], tube[1]), rates, clock.step, setting.noise * (1 + setting.spread))
@@ -263,12 +305,12 @@ def _near_wall(
 
 
 def _frame(
-    setting: Setting, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask,
+    images: Images, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask,
     index: tuple[Index, Index], live: Mask,
 ) -> Frame:  # fmt: skip
     y, q = axes
     spread = np.ix_(*index)
-    image, radius, known = _images(setting, clock, y, q, live)
+    image, radius, known = images
     mean = blocks.strays.mean
     drift = np.stack([mean[0] + abs(clock.shear) * mean[1], mean[1]])
     zero = np.where(usable, 1.0, 0.0)
@@ -287,7 +329,17 @@ def _strays(blocks: Blocks, usable: Mask, p: tuple[float, float]) -> tuple[list[
     return dips, [float(np.where(keep, blocks.strays.bow, 0.0).max()) for keep in near]
 
 
-def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> tuple[Array, Array, Mask]:
+def _around(images: list[Images]) -> Images:
+    """Images of several steps in one: what holds for its radii, twice as large as needed, holds for each."""
+    if len(images) == 1:
+        return images[0]
+    low = np.minimum.reduce([image - radius for image, radius, _ in images])
+    high = np.maximum.reduce([image + radius for image, radius, _ in images])
+    middle = (low + high) / 2
+    return middle, (high - low) * (1 + 1e-9) + 4e-16 * np.abs(middle), np.logical_and.reduce([one[2] for one in images])
+
+
+def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> Images:
     """Images of the nodes of live cells, their radii, and the cells all of whose nodes are known."""
     grid = Grid(axes=(y, q))
     touched = np.zeros(grid.node_shape, dtype=bool)
@@ -296,7 +348,7 @@ def _images(setting: Setting, clock: Clock, y: Array, q: Array, live: Mask) -> t
         touched[a, b] |= live
     place = np.nonzero(touched)
     tape = sheared(setting.tape, clock.shear)
-    flown = flow(tape, [Interval.point(y[place[0]]), Interval.point(q[place[1]])], clock.step, _ORDERS[2])
+    flown = flow(tape, [Interval.point(y[place[0]]), Interval.point(q[place[1]])], clock.step, _ORDERS[2], clock.begin)
     image, radius = np.zeros((2, *touched.shape)), np.zeros((2, *touched.shape))
     known = np.zeros(touched.shape, dtype=bool)
     known[place] = flown.known

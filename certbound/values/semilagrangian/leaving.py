@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from certbound.values.grids import around_nodes
 from certbound.values.scouting import Scouted, scouted
 from certbound.values.semilagrangian.backward import Bounds, back, highest, limited, lowest
 from certbound.values.semilagrangian.carried import bound_carried_exits, carries
-from certbound.values.semilagrangian.groundwork import Layout, layout_of, nodes_of
+from certbound.values.semilagrangian.groundwork import Layout, layouts_of, nodes_of, together
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
@@ -41,8 +42,10 @@ _FIRST = 0.25  # share of the work that a first look may take where no scout tel
 _SPARE = 1e-9
 _CAUTION = 0.1  # for a scout's answer
 _RATE = 800_000
-"""Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes."""
-_PREPARED = 20
+"""Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes, `_IMAGED`
+the images of its nodes at one more time.
+"""
+_PREPARED, _IMAGED = 20, 11
 _LEAST, _MOST = 8, 2000
 _PACE = 0.15  # the length of a scout's steps, as those of plans
 
@@ -55,7 +58,7 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     Parameters
     ----------
     problem : Problem
-        Two or three states in continuous time, constant noise in one of them, no time in the model.
+        Two or three states in continuous time, constant noise in one of them; of two states time may act on that one.
     seconds : float
         About what may be spent, as a number of nodes and steps: bounds do not depend on the clock. The coarsest grid
         is finished in any case.
@@ -87,10 +90,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     for k, (ratio, cells) in enumerate(chosen):
         plan = _plan(setting, turn, ratio, cells, spare)
         try:
-            layout = layout_of(setting, plan, scout)
-            best = min(best, bound_by_steps(setting, plan, layout))
-            if k == len(chosen) - 1:
-                least = bound_by_steps_below(setting, plan, layout)
+            upper, least = bounds_by_steps(setting, plan, scout=scout, below=k == len(chosen) - 1)
+            best = min(best, upper)
         except InfeasibleError as error:  # shorter steps may do
             failed = error
             continue
@@ -135,11 +136,13 @@ def _affordable(
     def needed(grade: int) -> float:
         plan = _plan(setting, turn, *_graded(grade), _SPARE)
         try:
-            return nodes_of(setting, plan, scout) * (2 * plan.count + _PREPARED)  # from above and from below
+            return nodes_of(setting, plan, scout) * (2 * plan.count + _prepared(setting, plan.count))
         except InfeasibleError:  # shorter steps may do
             return 0.0
 
     low, high = 0, _BETWEEN * (len(_PLANS) - 1) + 1
+    if setting.timed and needed(1) > work:  # the usual case, and every look at a plan costs a second
+        high = 1
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if needed(middle) <= work else (low, middle)
@@ -151,8 +154,8 @@ def scout_of(setting: Setting) -> Scouted | None:
     """Where paths that fail go, roughly; None where that is not found."""
     model = compile_numpy(setting.tape)
 
-    def drift(p: Array, q: Array) -> Array:
-        return np.moveaxis(np.broadcast_to(model(0.0, p, q), (len(p), 2)), -1, 0)
+    def drift(t: float, p: Array, q: Array) -> Array:
+        return np.moveaxis(np.broadcast_to(model(t, p, q), (len(p), 2)), -1, 0)
 
     def broken(p: Array, q: Array) -> Mask:
         found = np.zeros(len(p), dtype=bool)
@@ -161,38 +164,46 @@ def scout_of(setting: Setting) -> Scouted | None:
         return found
 
     steps = min(max(_LEAST, math.ceil(setting.horizon / (_PACE * _turn(setting)))), _MOST // 8)
-    return scouted(drift, setting.noise, setting.faces, setting.some_starts(), setting.horizon, steps, broken)
+    faces, starts, timed = setting.faces, setting.some_starts(), setting.timed
+    return scouted(drift, setting.noise, faces, starts, setting.horizon, steps, broken, timed=timed)
 
 
-def bound_by_steps(setting: Setting, plan: Plan, layout: Layout | None = None) -> float:
-    """Upper bound of the probability of leaving by the horizon, from one plan; at most 1."""
-    layout = layout or layout_of(setting, plan)
-    value = _stepped(layout, layout.above, plan)
-    if value is None:
-        return 1.0
-    best = highest(layout.frame, value, setting, layout.clock.shear)
-    return min(1.0, (best + _RARE * plan.count * plan.spare) * (1 + 1e-12))
+def bounds_by_steps(
+    setting: Setting, plan: Plan, *, scout: Scouted | None = None, layouts: Iterable[Layout] | None = None,
+    below: bool = True,
+) -> tuple[float, float]:  # fmt: skip
+    """Bounds (upper, lower) of the probability of leaving by the horizon from the worst start, from one plan.
 
-
-def bound_by_steps_below(setting: Setting, plan: Plan, layout: Layout | None = None) -> float:
-    """Lower bound of the probability of leaving by the horizon from some start; at least 0."""
-    layout = layout or layout_of(setting, plan)
-    value = _stepped(layout, layout.below, plan)
-    if value is None:
-        return 0.0
-    best = -lowest(layout.frame, value, setting.some_starts(), layout.clock.shear)
-    return max(0.0, best * (1 - 1e-12) - _RARE * plan.count * plan.spare)
-
-
-def _stepped(layout: Layout, bounds: Bounds, plan: Plan) -> Lines | None:
-    """The function at time 0, unless it grows too large."""
-    value = terminal(layout, bounds)
-    for _ in range(plan.count):
+    Parameters
+    ----------
+    layouts : iterable of Layout, optional
+        Those of `layouts_of`, made if not given.
+    below : bool
+        Whether a lower bound is asked for; else it is 0.
+    """
+    values: list[Lines | None] = []
+    layout: Layout | None = None
+    for following in layouts or layouts_of(setting, plan, scout):
         poll("a value function along the flow")
-        value = back(layout.frame, layout.bands, bounds, value)
-        if np.abs(value.nodal).max() > _TALLEST:
-            return None
-    return value
+        sides = [following.above, following.below][: 1 + below]
+        if layout is None:
+            values = [terminal(following, bounds) for bounds in sides]
+        elif following.bands is not layout.bands:  # what a step asks of the function at its end
+            values = [value and limited(following.frame, s, value.nodal, value.bend) for s, value in zip(sides, values)]
+        layout = following
+        values = [value and back(layout.frame, layout.bands, side, value) for side, value in zip(sides, values)]
+        values = [None if value is None or np.abs(value.nodal).max() > _TALLEST else value for value in values]
+        if not any(values):
+            break
+    assert layout is not None
+    upper, lower, rare = 1.0, 0.0, _RARE * plan.count * plan.spare
+    if values[0] is not None:
+        best = highest(layout.frame, values[0], setting, layout.clock.shear)
+        upper = min(1.0, (best + rare) * (1 + 1e-12))
+    if below and values[1] is not None:
+        best = -lowest(layout.frame, values[1], setting.some_starts(), layout.clock.shear)
+        lower = max(0.0, best * (1 - 1e-12) - rare)
+    return upper, lower
 
 
 def terminal(layout: Layout, bounds: Bounds) -> Lines:
@@ -202,12 +213,19 @@ def terminal(layout: Layout, bounds: Bounds) -> Lines:
     return limited(layout.frame, bounds, np.where(stepped, 0.0, -np.inf), np.zeros((shape[0], shape[1] - 1)))
 
 
+def _prepared(setting: Setting, count: int) -> int:
+    """Preparing so many steps, in units of steps."""
+    return math.ceil(count / together(setting, count)) * _PREPARED + count * _IMAGED if setting.timed else _PREPARED
+
+
 def _turn(setting: Setting) -> float:
     """The time in which the linearised flow turns or grows by one radian, about; the median over the safe set."""
     grid = np.meshgrid(*(np.linspace(*ends, 9) for ends in setting.faces))
+    times = np.linspace(0.0, setting.horizon, 5 if setting.timed else 1)
+    jacobians = compile_numpy(jacobian(setting.tape, (1, 2)))
     with np.errstate(all="ignore"):
-        slopes = np.asarray(compile_numpy(jacobian(setting.tape, (1, 2)))(0.0, *(a.ravel() for a in grid)))
-    slopes = np.broadcast_to(slopes, (grid[0].size, 2, 2))
+        every = [np.asarray(jacobians(float(t), *(a.ravel() for a in grid))) for t in times]
+    slopes = np.concatenate([np.broadcast_to(found, (grid[0].size, 2, 2)) for found in every])
     rates = _rates(slopes[np.isfinite(slopes).all(axis=(1, 2))])
     if not len(rates):
         raise InfeasibleError("the model is undefined all over the safe set.")

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
 from certbound.rigor.intervals import Interval, concatenate, sq
+from certbound.rigor.series import ZERO
 from certbound.values.grids import graded_axis
 from certbound.values.scouting import Scouted
 from certbound.values.semilagrangian.confines import Ends
-from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
+from certbound.values.semilagrangian.flows import EQUATIONS, augmented, during, flow, sheared
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.remainders import Remainders, remainders
 
@@ -47,12 +48,18 @@ class Plan:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Clock:
-    """One step: its length h, the shear, and the level of the noise that is followed (``remainders``)."""
+    """One step: its length h, the shear, the level of the noise that is followed (``remainders``), when it begins."""
 
     step: float
     count: int
     shear: float
     omega: float
+    begin: Interval = field(default_factory=lambda: ZERO)
+
+    @property
+    def times(self) -> Interval:
+        """All times of the step."""
+        return during(self.begin, self.step)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -100,14 +107,15 @@ def blocks_of(
     zero, one = Interval.point(np.zeros(2 * size)), Interval.point(np.ones(2 * size))
     tape = augmented(sheared(setting.tape, clock.shear), setting.noise, clock.shear)
     rest = [one, zero, zero, one, *[zero] * (EQUATIONS - 6)]
-    flown = flow(tape, [*both, *rest], clock.step, order)
+    flown = flow(tape, [*both, *rest], clock.step, order, clock.begin)
     end, centre = [value[:size] for value in flown.end], [value[size:] for value in flown.end]
     away = [value - point for value, point in zip(box, middle)]
     covariance = [_both(end[k], centre[k] + end[k + 3] * away[0] + end[k + 6] * away[1]) for k in range(10, 13)]
     p = box[0] + box[1] * clock.shear
     strays = remainders(
-        setting.tape, setting.noise * (1 + setting.spread), p, box[1], step=clock.step, omega=clock.omega
-    )
+        setting.tape, setting.noise * (1 + setting.spread), p, box[1], step=clock.step, omega=clock.omega,
+        begin=clock.begin,
+    )  # fmt: skip
     loose = Interval(1 - 4 * setting.spread - 1e-15, 1 + 4 * setting.spread + 1e-15)
 
     def filled(part: Array) -> Array:

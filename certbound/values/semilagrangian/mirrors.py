@@ -317,7 +317,7 @@ def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wi
     for _ in range(12):
         near = Interval(face - away, face + away)
         end = Interval(*ends) + near * clock.shear
-        f, good = _rates(setting, Interval(end.lo - along, end.hi + along), near)
+        f, good = _rates(setting, clock, Interval(end.lo - along, end.hi + along), near)
         rise, fall = np.maximum(f.hi[:, 0], 0.0), np.minimum(f.lo[:, 0], 0.0)
         travel, needed = (rise - fall) * h * _UP, swing + h * f[:, 1].mag * _UP
         fine = good & (travel <= along) & (needed <= away)
@@ -329,15 +329,15 @@ def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wi
     path = Interval(
         end.lo - np.where(rise > 0, travel, apart), end.hi + np.where(fall < 0, travel, apart)
     )
-    f, good = _rates(setting, path, near)
-    slopes, bad, _ = evaluate(jacobian(setting.tape, (1, 2)), [Interval.point(np.zeros(len(y))), path, near])
+    f, good = _rates(setting, clock, path, near)
+    slopes, bad, _ = evaluate(jacobian(setting.tape, (1, 2)), [clock.times, path, near])
     fine = fine & good & ~bad & np.isfinite(slopes.mag).reshape(len(y), -1).all(axis=1)
     slope, pull, width = slopes[:, 1], -slopes[:, 3], (f.hi[:, 1] - f.lo[:, 1])
     middle = np.abs(slope.mid)
     deviation = setting.noise * np.sqrt(h**3 / 3 * middle**2 + abs(clock.shear) * h**2 * middle + clock.shear**2 * h)
     spread = middle * h**2 / 2 * width + 2 * (wide + 1) * deviation + h * abs(clock.shear) * width
     spread += h * (2 * slopes[:, 0].mag * travel + 2 * slope.rad * away)
-    at, good = _rates(setting, path, Interval.point(np.full(len(y), face)))
+    at, good = _rates(setting, clock, path, Interval.point(np.full(len(y), face)))
     inward, start = (-part[:, 1] if side else part[:, 1] for part in (f, at))
     fine = fine & good & np.isfinite(pull.mid)
     k = np.where(fine, pull.mid, 0.0)
@@ -351,8 +351,8 @@ def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wi
     )  # fmt: skip
 
 
-def _rates(setting: Setting, p: Interval, q: Interval) -> tuple[Interval, Mask]:
-    f, undefined, jumps = evaluate(setting.tape, [Interval.point(np.zeros(len(p.lo))), p, q])
+def _rates(setting: Setting, clock: Clock, p: Interval, q: Interval) -> tuple[Interval, Mask]:
+    f, undefined, jumps = evaluate(setting.tape, [clock.times, p, q])
     fine = ~undefined & ~jumps & np.isfinite(f.mag).all(axis=1)
     return Interval(np.where(fine[:, None], f.lo, -1e9), np.where(fine[:, None], f.hi, 1e9)), fine
 

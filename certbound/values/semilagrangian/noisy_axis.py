@@ -28,7 +28,7 @@ class Setting:
     Attributes
     ----------
     tape : Tape
-        (F, g) over ("t", "p", "q"), free of t.
+        (F, g) over ("t", "p", "q"), F free of t.
     noise : float
         s, up to the relative error ``spread``.
     faces, starts : (Ends, Ends)
@@ -52,6 +52,11 @@ class Setting:
     walls: tuple[Wall, ...] = ()
     region: Region | None = None
     order: tuple[int, int] = (0, 1)
+
+    @property
+    def timed(self) -> bool:
+        """Whether the model changes with time."""
+        return 0 in sources(self.tape)[1]
 
     def starts_between(self, low: float, high: float) -> Ends:
         """Ends of p among the starts with low <= q <= high, rounded outward; a ball's are narrower than its box's."""
@@ -102,7 +107,7 @@ def setting_of(problem: Problem) -> Setting:
     Raises
     ------
     InfeasibleError
-        Disturbances, time in the model, windows, moving sets; the message says which.
+        Disturbances, time in the drift of the noise-free state, windows, moving sets; the message says which.
     """
     system = problem.system
     if not serves(problem) or not isinstance(system, ContinuousSystem) or system.dimension != 2:
@@ -116,9 +121,19 @@ def setting_of(problem: Problem) -> Setting:
     noisy = int(np.flatnonzero(np.any(gain != 0, axis=1))[0])
     order = (1 - noisy, noisy)
     tape = reordered(problem.closed_loop, order)
+    if 0 in sources(tape)[0]:
+        raise InfeasibleError(
+            "value functions with noise in one coordinate let time act on that coordinate only, and "
+            f"`{system.states[order[0]]}` changes with it; value functions prove nothing here."
+        )
     size = sqrt(sq(Interval.point(gain[noisy])).sum(axis=-1))
     starts = starts_of(problem)
     bounds, beyond, walls = _limits(problem, order)
+    if 0 in sources(tape)[1] and any(wall.ends() is not None for wall in walls):
+        raise InfeasibleError(
+            "value functions with noise in one coordinate do not take obstacles beside a model that changes with time "
+            "yet; value functions prove nothing here."
+        )
     ends = (starts[order[0]], starts[order[1]])
     noise = float(size.mid)
     faces = _closed(tape, noise, bounds, walls, ends, float(problem.horizon))
@@ -204,9 +219,9 @@ def _reach(
     x = np.array([rng.uniform(*places, _PATHS) for places in starts])
     least, most = x.min(axis=1), x.max(axis=1)
     step = horizon / _STEPS
-    for _ in range(_STEPS):
+    for k in range(_STEPS):
         with np.errstate(all="ignore"):
-            f = np.moveaxis(np.broadcast_to(drift(0.0, *x), (_PATHS, 2)), -1, 0)
+            f = np.moveaxis(np.broadcast_to(drift(k * step, *x), (_PATHS, 2)), -1, 0)
         moved = x + step * f
         moved[1] += noise * math.sqrt(step) * rng.standard_normal(_PATHS)
         inside = np.all((x >= ends[0][:, None]) & (x <= ends[1][:, None]) & np.isfinite(moved), axis=0)
@@ -217,12 +232,7 @@ def _reach(
 
 
 def reordered(tape: Tape, order: tuple[int, ...]) -> Tape:
-    """The drift over time and the states in an order; InfeasibleError where it depends on time."""
-    if any(0 in found for found in sources(tape)):
-        raise InfeasibleError(
-            "value functions with noise in one coordinate serve no models that change with time yet; "
-            "value functions prove nothing here."
-        )
+    """The drift over time and the states in an order."""
     graph = Graph(("t", *(f"y{place}" for place in range(len(order)))))
     slots = [0] * (len(order) + 1)
     for place, state in enumerate(order):

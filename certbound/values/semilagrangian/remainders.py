@@ -30,8 +30,9 @@ import numpy as np
 from certbound.arrays import Array, Mask
 from certbound.problem.model import Tape, jacobian
 from certbound.rigor.intervals import Interval
+from certbound.rigor.series import ZERO
 from certbound.values.discrete import evaluate
-from certbound.values.semilagrangian.flows import reachable
+from certbound.values.semilagrangian.flows import during, reachable
 
 _UP = 1 + 1e-9
 _PARTS = 400
@@ -104,39 +105,42 @@ def bowed(near: Array, far: float) -> Array:
 
 
 def remainders(
-    tape: Tape, noise: float, p: Interval, q: Interval, *, step: float, omega: float
+    tape: Tape, noise: float, p: Interval, q: Interval, *, step: float, omega: float, begin: Interval = ZERO
 ) -> Remainders:
     """Bound what the linearisation leaves out over one step from every box.
 
     Parameters
     ----------
     tape : Tape
-        f over (t, p, q), free of t.
+        f over (t, p, q), its first row free of t.
     noise : float
         s; the noise moves q only.
     p, q : Interval, shape (N,)
         Boxes of starts.
     step, omega : float
+    begin : Interval
+        Times at which the step begins.
     """
     size = p.lo.shape
-    way, known = reachable(tape, [p, q], step)
+    way, known = reachable(tape, [p, q], step, begin)
+    time = during(begin, step)
     first = jacobian(tape, (1, 2))
     second = jacobian(first, (1, 2))
     push = np.stack([np.zeros(size), np.full(size, noise * omega * math.sqrt(step) * _UP)])
     settled = np.zeros(size, dtype=bool)
     tube = [Interval(w.lo - d, w.hi + d) for w, d in zip(way, push)]
-    slopes, _ = _magnitudes(first, tube)
+    slopes, _ = _magnitudes(first, time, tube)
     stray = 1.3 * (push + step * np.einsum("ijn,jn->in", slopes, push))
     for _ in range(8):
         tube = [Interval(w.lo - d, w.hi + d) for w, d in zip(way, stray)]
-        slopes, fine = _magnitudes(first, tube)
+        slopes, fine = _magnitudes(first, time, tube)
         needed = (push + step * np.einsum("ijn,jn->in", slopes, stray)) * _UP
         settled = fine & np.all(needed <= stray, axis=0)
         if settled.all():
             break
         stray = np.where(settled, stray, np.where(fine, np.maximum(stray, 1.1 * needed), stray))
     known = known & settled
-    bends, fine = _magnitudes(second, tube)
+    bends, fine = _magnitudes(second, time, tube)
     known = known & fine
     bends = np.where(known, bends.reshape(2, 2, 2, *size), 0.0)
     slopes = np.where(known, slopes, 0.0)
@@ -147,15 +151,15 @@ def remainders(
     spread = gain**2 * step**2 / 2 + gain * rate * step**3 / 3 + rate**2 * step**4 / 12
     root = np.sqrt(spread) + most * math.sqrt(step)
     mean = _through(growth, 0.5 * np.einsum("kijn,in,jn->kn", bends, root, root)) * _UP
-    dip, bow, inward, fine = _strays(tape, first, second, noise, tube, step)
+    dip, bow, inward, fine = _strays((tape, first, second), noise, time, tube, step)
     return Remainders(
         most=most, mean=mean, dip=dip, bow=bow, inward=inward, tube=(tube[0], tube[1]), known=known & fine
     )
 
 
-def _magnitudes(tape: Tape, tube: list[Interval]) -> tuple[Array, Mask]:
+def _magnitudes(tape: Tape, time: Interval, tube: list[Interval]) -> tuple[Array, Mask]:
     """sup |outputs| over the boxes, shape (rows, columns, N), and where it is known."""
-    found, undefined, jumps = evaluate(tape, [Interval.point(np.zeros(tube[0].lo.shape)), *tube])
+    found, undefined, jumps = evaluate(tape, [time, *tube])
     size = found.mag
     fine = np.isfinite(size).all(axis=1) & ~undefined & ~jumps
     return np.where(fine[:, None], size, 0.0).T.reshape(*tape.shape, -1), fine
@@ -186,13 +190,10 @@ def _through(matrix: Array, vector: Array) -> Array:
 
 
 def _strays(
-    tape: Tape, first: Tape, second: Tape, noise: float, tube: list[Interval], step: float
+    tapes: tuple[Tape, Tape, Tape], noise: float, time: Interval, tube: list[Interval], step: float
 ) -> tuple[Array, Array, Array, Mask]:
     """Bounds of the distance of p from its chord in two parts, and of q's drift, over the tube."""
-    inputs = [Interval.point(np.zeros(tube[0].lo.shape)), *tube]
-    f, bad, _ = evaluate(tape, inputs)
-    a, worse, _ = evaluate(first, inputs)
-    c, worst, _ = evaluate(second, inputs)
+    (f, bad, _), (a, worse, _), (c, worst, _) = (evaluate(tape, [time, *tube]) for tape in tapes)
     fine = ~bad & ~worse & ~worst & np.isfinite(np.hstack([f.mag, a.mag, c.mag])).all(axis=1)
 
     def safe(value: Interval) -> Interval:

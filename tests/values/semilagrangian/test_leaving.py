@@ -9,6 +9,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.special import ndtr
 
@@ -16,17 +17,25 @@ import certbound as cb
 from certbound.problem.model import compile_numpy
 from certbound.rigor.intervals import Interval
 from certbound.safety.engines import values
-from certbound.values.semilagrangian import bound_exits_by_steps, leaving, mirrors
+from certbound.values.semilagrangian import bound_exits_by_steps, groundwork, leaving, mirrors
 from certbound.values.semilagrangian.backward import back
 from certbound.values.semilagrangian.confines import Wall
-from certbound.values.semilagrangian.groundwork import layout_of, nodes_of
-from certbound.values.semilagrangian.leaving import bound_by_steps, bound_by_steps_below
+from certbound.values.semilagrangian.groundwork import layouts_of, nodes_of
+from certbound.values.semilagrangian.leaving import bounds_by_steps
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import setting_of
 from certbound.watch import OutOfTime, Watch
 
 COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-12)
+
+
+def bound_by_steps(setting, plan: Plan, layout=None, *, side: int = 0) -> float:
+    return bounds_by_steps(setting, plan, layouts=layout and [layout] * plan.count)[side]
+
+
+def bound_by_steps_below(setting, plan: Plan, layout=None) -> float:
+    return bound_by_steps(setting, plan, layout, side=1)
 
 
 def mechanical(force, s: float, low, high, horizon: float, start) -> cb.Problem:
@@ -41,8 +50,8 @@ def simulated(problem: cb.Problem, paths: int, rng: np.random.Generator) -> tupl
     d = setting.horizon / parts
     p, q = (np.full(paths, ends[0]) for ends in setting.starts)
     inside = np.ones(paths, dtype=bool)
-    for _ in range(parts):
-        f = drift(0.0, p, q)
+    for k in range(parts):
+        f = drift(k * d, p, q)
         noise = setting.noise * math.sqrt(d) * rng.standard_normal(paths)
         p, q = p + d * (f[..., 0] + noise / 2), q + d * f[..., 1] + noise
         for x, ends in zip((p, q), setting.faces):
@@ -66,7 +75,7 @@ def simulated(problem: cb.Problem, paths: int, rng: np.random.Generator) -> tupl
 def test_the_bound_is_above_what_simulation_counts_and_near_it(force, s, low, high, start, most) -> None:
     problem = mechanical(force, s, low, high, 1.5, start)
     setting = setting_of(problem)
-    layout = layout_of(setting, COARSE)
+    layout = next(layouts_of(setting, COARSE))
     bound, below = (side(setting, COARSE, layout) for side in (bound_by_steps, bound_by_steps_below))
     share, error = simulated(problem, 8000, np.random.default_rng(1))
     assert bound >= share - 4 * error
@@ -84,7 +93,7 @@ def wiener_exit(s: float, horizon: float) -> float:
 def test_at_a_face_of_the_noise_hardly_anything_is_lost_on_either_side() -> None:
     setting = setting_of(mechanical(lambda x: 0.0 * x[0], 0.8, [-2, -1], [2, 1], 0.5, (0.0, 0.0)))
     plan = Plan(count=8, fine=2.0, wide=0.02, cell=0.4, spare=1e-15)
-    layout = layout_of(setting, plan)
+    layout = next(layouts_of(setting, plan))
     exact = wiener_exit(0.8, 0.5)
     assert exact < bound_by_steps(setting, plan, layout) < 1.12 * exact
     assert exact > bound_by_steps_below(setting, plan, layout) > 0.85 * exact
@@ -108,7 +117,7 @@ def test_limits_of_other_shapes_are_bounded_from_both_sides(safe, most) -> None:
     problem = pulled(safe)
     setting = setting_of(problem)
     plan = Plan(count=24, fine=1.0, wide=0.01, cell=0.4, spare=1e-15)
-    layout = layout_of(setting, plan)
+    layout = next(layouts_of(setting, plan))
     upper, lower = bound_by_steps(setting, plan, layout), bound_by_steps_below(setting, plan, layout)
     rng, d = np.random.default_rng(2), 1.2 / 600
     x, failed = np.tile([0.1, 0.0], (8000, 1)), np.zeros(8000, dtype=bool)
@@ -234,6 +243,47 @@ def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
     assert more != some
 
 
+def test_a_force_that_changes_with_time_acts_when_it_does() -> None:
+    plan, found = replace(COARSE, count=6, wide=0.03), []
+    for push in (2.5, -2.5):  # the same in reversed order
+        problem = pushed(lambda t, push=push: push * np.sin(4 * np.pi * t), 0.5)
+        upper, lower = bounds_by_steps(setting_of(problem), plan)
+        share, error = simulated(problem, 10_000, np.random.default_rng(1))
+        assert lower < share + 4 * error and share - 4 * error < upper
+        assert share < 2.5 * lower and upper < 3 * share
+        found.append((lower, upper))
+    assert found[1][1] < found[0][0]
+
+
+def test_steps_that_are_prepared_at_once_have_images_of_their_own(monkeypatch) -> None:
+    monkeypatch.setattr(groundwork, "_ALIKE", 10.0)
+    setting = setting_of(pushed(lambda t: 2.5 * np.sin(4 * np.pi * t), 0.5))
+    layouts = list(layouts_of(setting, replace(COARSE, count=4, fine=2.0, wide=0.05)))
+    assert len({id(layout.bands) for layout in layouts}) == 1
+    drift = compile_numpy(setting.tape)
+    for k, layout in zip((3, 2, 1, 0), layouts):
+        frame, h, shear = layout.frame, layout.clock.step, layout.clock.shear
+        assert layout.clock.begin.lo == 0 and layout.clock.begin.hi >= 3 * h
+        i, j = len(frame.y) // 2, len(frame.q) // 2
+        start = frame.y[i] + shear * frame.q[j], frame.q[j]
+        p, q = solve_ivp(lambda t, x: drift(t, *x), (k * h, (k + 1) * h), start, rtol=1e-10, atol=1e-12).y[:, -1]
+        assert np.all(np.abs(frame.image[:, i, j] - [p - shear * q, q]) <= frame.radius[:, i, j] + 1e-9)
+        assert frame.radius[:, i, j].max() < 1e-3
+
+
+def test_a_model_that_names_the_time_but_is_at_rest_has_the_bounds_of_one_that_does_not() -> None:
+    plan = replace(COARSE, count=3, wide=0.03)
+    still, clocked = (setting_of(pushed(push, 0.5)) for push in (lambda t: 0 * t, lambda t: np.minimum(t + 2, 1) - 1))
+    assert clocked.timed and not still.timed
+    assert bounds_by_steps(clocked, plan) == pytest.approx(bounds_by_steps(still, plan), rel=1e-6)
+
+
+def pushed(push, horizon: float) -> cb.Problem:
+    """A velocity with friction, noise and a force that depends on time."""
+    system = cb.ContinuousSystem(lambda x, t: [x[1], push(t) - 0.7 * x[1]], states=2, diffusion=[[0.0], [0.7]])
+    return cb.Problem(system, initial=[0.0, 0.3], safe=[cb.Inside(cb.Box([-1, -1.5], [1, 1.5]))], horizon=horizon)
+
+
 def test_the_steps_end_when_the_time_is_over() -> None:
     setting = setting_of(mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.5, (0.1, 0.0)))
     ticks = itertools.count()
@@ -320,7 +370,7 @@ def test_on_a_scouted_grid_the_bounds_hold() -> None:
     rng, problem = np.random.default_rng(8), scouted_problem()
     setting = setting_of(problem)
     plan = replace(COARSE, count=15, loss=0.01, cell=0.3)
-    seeing = layout_of(setting, plan, leaving.scout_of(setting))
+    seeing = next(layouts_of(setting, plan, leaving.scout_of(setting)))
     share, error = simulated(problem, 3_000, rng)
     upper, lower = bound_by_steps(setting, plan, seeing), bound_by_steps_below(setting, plan, seeing)
     assert lower - 4 * error < share < upper + 4 * error
@@ -331,7 +381,7 @@ def test_who_bows_out_within_a_step_is_counted() -> None:
     rng = np.random.default_rng(9)
     problem = mechanical(lambda x: 2.0 + 0 * x[0], 0.5, [0, -2], [2, 2], 0.1, (1.0, 0.0))  # pushed back inside
     setting, h = setting_of(problem), 0.1
-    layout = layout_of(setting, replace(COARSE, count=1))
+    layout = next(layouts_of(setting, replace(COARSE, count=1)))
     value = back(layout.frame, layout.bands, layout.above, leaving.terminal(layout, layout.above))
     bow = 0.5 * h**1.5
     for p, q in ((0.4 * bow, 0.0), (0.8 * bow, 0.0), (1.5 * bow, -0.1), (0.6 * bow, 0.1), (5 * bow, -0.6)):
@@ -352,7 +402,7 @@ def test_cells_beside_a_face_pay_for_paths_that_leave_and_come_back_within_a_ste
     """dp = v dt, dv = s dW: from a cell's end towards the face, at speeds that lead back or along it."""
     s, plan, rng = 0.8, replace(COARSE, count=4, cell=0.8), np.random.default_rng(7)
     setting = setting_of(mechanical(lambda x: 0.0 * x[0], s, [-1, -3], [1, 3], 1.0, (0.0, 0.0)))
-    layout = layout_of(setting, plan)
+    layout = next(layouts_of(setting, plan))
     h, paid = layout.clock.step, layout.above.paid
     short = 0.3 * s * h**1.5  # who ends nearer to the face than that is counted as having left
     y, q, shear = layout.frame.y, layout.frame.q, layout.clock.shear

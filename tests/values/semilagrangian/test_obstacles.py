@@ -12,7 +12,7 @@ import certbound as cb
 from certbound.rigor.intervals import Interval
 from certbound.values.semilagrangian import leaving
 from certbound.values.semilagrangian.backward import back
-from certbound.values.semilagrangian.groundwork import layout_of
+from certbound.values.semilagrangian.groundwork import layouts_of
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import setting_of
 from certbound.values.semilagrangian.obstacles.passings import meeting, passed, passing
@@ -24,7 +24,7 @@ def test_one_step_counts_who_meets_an_obstacle_and_ends_beside_it() -> None:
     system = cb.ContinuousSystem(lambda x: [x[1], 0.7 - 0.5 * x[0] - x[1] - 0.75], states=2, diffusion=[[0.0], [s]])
     safe = [cb.Outside(cb.Box([-0.6, -1.2], [0.0, -0.75])), cb.Inside(cb.Box([-0.4, -1.15], [0.2, -0.35]))]
     setting = setting_of(cb.Problem(system, initial=[0.1, -0.6], safe=safe, horizon=0.1))
-    layout = layout_of(setting, Plan(count=1, fine=3.0, wide=0.05, cell=0.35, spare=1e-6))
+    layout = next(layouts_of(setting, Plan(count=1, fine=3.0, wide=0.05, cell=0.35, spare=1e-6)))
     value = back(layout.frame, layout.bands, layout.above, leaving.terminal(layout, layout.above))
     under = back(layout.frame, layout.bands, layout.below, leaving.terminal(layout, layout.below))
     y, q, h, rng = layout.frame.y, layout.frame.q, layout.clock.step, np.random.default_rng(3)

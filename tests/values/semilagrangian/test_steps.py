@@ -21,7 +21,7 @@ from certbound.values.semilagrangian import bands, landings
 from certbound.values.semilagrangian.backward import Bounds, back, limited
 from certbound.values.semilagrangian.bands import Band, Frame, through
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
-from certbound.values.semilagrangian.groundwork import layout_of
+from certbound.values.semilagrangian.groundwork import layouts_of
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import serves, setting_of
 from certbound.values.semilagrangian.remainders import bowed, level_of, remainders, upper_tail
@@ -181,7 +181,7 @@ def test_the_majorant_of_the_smoothed_function_lies_above_it_and_so_do_its_deriv
 def frame_and_bands(problem: cb.Problem, **plan):
     settings = {"count": 10, "fine": 1.2, "wide": 0.02, "cell": 0.5, "spare": 1e-7} | plan
     setting = setting_of(problem)
-    return setting, layout_of(setting, Plan(**settings))
+    return setting, next(layouts_of(setting, Plan(**settings)))
 
 
 def step_law(setting, clock, x, rng, count: int):
@@ -396,13 +396,19 @@ def test_which_problems_are_served_and_what_the_others_are_told() -> None:
     assert serves(duffing())
     both = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.1, 0], [0, 0.3]])
     assert not serves(replace(duffing(), system=both))
-    clocked = cb.ContinuousSystem(lambda x, t: [x[1], -x[0] + t], states=2, diffusion=[[0.0], [0.3]])
-    with pytest.raises(InfeasibleError, match="change with time"):
-        setting_of(cb.Problem(clocked, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1))
+    box = cb.Inside(cb.Box([-1, -1], [1, 1]))
+    clocked = cb.ContinuousSystem(lambda x, t: [x[1] + t, -x[0]], states=2, diffusion=[[0.0], [0.3]])
+    with pytest.raises(InfeasibleError, match="`x1` changes with it"):
+        setting_of(cb.Problem(clocked, initial=[0, 0], safe=[box], horizon=1))
+    driven = cb.ContinuousSystem(lambda x, t: [x[1], -x[0] + t], states=2, diffusion=[[0.0], [0.3]])
+    past = cb.Outside(cb.Box([0.5, 0.5], [0.7, 0.7]))
+    assert setting_of(cb.Problem(driven, initial=[0, 0], safe=[box], horizon=1)).timed
+    with pytest.raises(InfeasibleError, match="obstacles beside a model that changes with time"):
+        setting_of(cb.Problem(driven, initial=[0, 0], safe=[box, past], horizon=1))
     lonely = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=[[0.0], [0.3]])
     problem = cb.Problem(lonely, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
     with pytest.raises(InfeasibleError, match="hardly reaches"):
-        layout_of(setting_of(problem), Plan(count=10, fine=0.7, wide=0.01, cell=0.35, spare=1e-7))
+        next(layouts_of(setting_of(problem), Plan(count=10, fine=0.7, wide=0.01, cell=0.35, spare=1e-7)))
 
 
 def pendulum_of(unit: float):

@@ -10,7 +10,7 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Tape, compile_numpy
+from certbound.problem.model import Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.problem.systems import ContinuousSystem
@@ -98,6 +98,11 @@ def voyage_of(problem: Problem) -> Voyage:
     noisy = int(np.flatnonzero(np.any(gain != 0, axis=1))[0])
     order = (*(k for k in range(STATES) if k != noisy), noisy)
     size = sqrt(sq(Interval.point(gain[noisy])).sum(axis=-1))
+    if any(0 in found for found in sources(problem.closed_loop)):
+        raise InfeasibleError(
+            "value functions with noise in one of three coordinates serve no models that change with time yet; "
+            "value functions prove nothing here."
+        )
     tape = reordered(problem.closed_loop, order)
     starts = starts_of(problem)
     stays, obstacles, limits = _limits(problem, noisy)
