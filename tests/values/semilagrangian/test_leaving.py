@@ -249,8 +249,10 @@ def test_a_force_that_changes_with_time_acts_when_it_does() -> None:
         problem = pushed(lambda t, push=push: push * np.sin(4 * np.pi * t), 0.5)
         upper, lower = bounds_by_steps(setting_of(problem), plan)
         share, error = simulated(problem, 10_000, np.random.default_rng(1))
-        assert lower < share + 4 * error and share - 4 * error < upper
-        assert share < 2.5 * lower and upper < 3 * share
+        assert lower < share + 4 * error
+        assert share - 4 * error < upper
+        assert share < 2.5 * lower
+        assert upper < 3 * share
         found.append((lower, upper))
     assert found[1][1] < found[0][0]
 
@@ -263,7 +265,8 @@ def test_steps_that_are_prepared_at_once_have_images_of_their_own(monkeypatch) -
     drift = compile_numpy(setting.tape)
     for k, layout in zip((3, 2, 1, 0), layouts):
         frame, h, shear = layout.frame, layout.clock.step, layout.clock.shear
-        assert layout.clock.begin.lo == 0 and layout.clock.begin.hi >= 3 * h
+        assert layout.clock.begin.lo == 0
+        assert layout.clock.begin.hi >= 3 * h
         i, j = len(frame.y) // 2, len(frame.q) // 2
         start = frame.y[i] + shear * frame.q[j], frame.q[j]
         p, q = solve_ivp(lambda t, x: drift(t, *x), (k * h, (k + 1) * h), start, rtol=1e-10, atol=1e-12).y[:, -1]
@@ -274,7 +277,8 @@ def test_steps_that_are_prepared_at_once_have_images_of_their_own(monkeypatch) -
 def test_a_model_that_names_the_time_but_is_at_rest_has_the_bounds_of_one_that_does_not() -> None:
     plan = replace(COARSE, count=3, wide=0.03)
     still, clocked = (setting_of(pushed(push, 0.5)) for push in (lambda t: 0 * t, lambda t: np.minimum(t + 2, 1) - 1))
-    assert clocked.timed and not still.timed
+    assert clocked.timed
+    assert not still.timed
     assert bounds_by_steps(clocked, plan) == pytest.approx(bounds_by_steps(still, plan), rel=1e-6)
 
 
