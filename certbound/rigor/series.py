@@ -129,24 +129,24 @@ def log(x: Series, order: int) -> Series:
     return _spoiled(x[0].lo <= 0, integral(iv.log(x[0]), derivative(x, order), x, order))
 
 
-def _pair(x: Series, first: Interval, second: Interval, sign: float, order: int) -> tuple[Series, Series]:
+def _pair(x: Series, known: tuple[Series, Series], sign: float, order: int) -> tuple[Series, Series]:
     """sin and cos (sign -1), or sinh and cosh (sign 1), which differentiate into each other."""
-    one, two, slopes = [first], [second], _slopes(x, order)
-    for k in range(1, order + 1):
+    one, two, slopes = [*known[0]], [*known[1]], _slopes(x, order)
+    for k in range(len(one), order + 1):
         odd, even = _next(slopes, two, k), _next(slopes, one, k, sign)
         one.append(odd)
         two.append(even)
     return one, two
 
 
-def circular(x: Series, order: int) -> tuple[Series, Series]:
-    """Sine and cosine."""
-    return _pair(x, iv.sin(x[0]), iv.cos(x[0]), -1.0, order)
+def circular(x: Series, order: int, known: tuple[Series, Series] | None = None) -> tuple[Series, Series]:
+    """Sine and cosine; their first coefficients may be ``known``."""
+    return _pair(x, known or ([iv.sin(x[0])], [iv.cos(x[0])]), -1.0, order)
 
 
 def hyperbolic(x: Series, order: int) -> tuple[Series, Series]:
     """Hyperbolic sine and cosine."""
-    return _pair(x, iv.sinh(x[0]), iv.cosh(x[0]), 1.0, order)
+    return _pair(x, ([iv.sinh(x[0])], [iv.cosh(x[0])]), 1.0, order)
 
 
 def _riccati(x: Series, first: Interval, sign: float, order: int) -> Series:
@@ -196,12 +196,12 @@ def atan2(y: Series, x: Series, order: int) -> Series:
     return _spoiled(iv.across_cut(y[0], x[0]), result)
 
 
-def power(x: Series, exponent: float, order: int) -> Series:
-    """x ** exponent for a constant exponent."""
+def power(x: Series, exponent: float, order: int, times: Callable[[Series, Series, int], Series] = product) -> Series:
+    """x ** exponent for a constant exponent; ``times`` multiplies."""
     if len(x) == 1:
         return [iv.pow_(x[0], exponent)]
     if exponent == int(exponent) and abs(exponent) <= 64:
-        result = _integer_power(x, abs(int(exponent)), order)
+        result = _integer_power(x, abs(int(exponent)), order, times)
         if exponent < 0:
             result = divide([Interval.point(1.0)], result, order)
         result[0] = iv.pow_(x[0], exponent)
@@ -216,15 +216,17 @@ def power(x: Series, exponent: float, order: int) -> Series:
     return _spoiled(iv.power_undefined(x[0], exponent), result)
 
 
-def _integer_power(x: Series, exponent: int, order: int) -> Series:
+def _integer_power(
+    x: Series, exponent: int, order: int, times: Callable[[Series, Series, int], Series]
+) -> Series:
     result: Series = [Interval.point(1.0)]
     factor = x
     while exponent:
         if exponent & 1:
-            result = product(result, factor, order) if len(result) > 1 or exponent > 1 or factor is not x else factor
+            result = times(result, factor, order) if len(result) > 1 or exponent > 1 or factor is not x else factor
         exponent >>= 1
         if exponent:
-            factor = product(factor, factor, order)
+            factor = times(factor, factor, order)
     return list(result)
 
 

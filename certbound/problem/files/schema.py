@@ -50,12 +50,14 @@ class _Table(BaseModel):
         known = [*cls.model_fields, *cls.more_keys()]
         for key in value:
             if key not in known:
-                raise ValueError(f"unknown key {key!r} in {cls.title}{_hint(str(key), known)}")
+                raise ValueError(f"unknown key {key!r} in {cls.title}{_hint(str(key), known, value.get('law'))}")
         return value
 
 
-def _hint(key: str, known: list[str]) -> str:
-    """The nearest key of a table, or how a law is named, or the tables in which this one stands."""
+def _hint(key: str, known: list[str], law: Any = None) -> str:
+    """The nearest key of a table, or how a law is named or sized, or the tables in which this one stands."""
+    if "law" in known and law in LAWS and LAWS[law].levels:
+        return f"; write {' or '.join(f'{level} = 0.1' for level in LAWS[law].levels)} for the size of {law!r} noise."
     if key in LAWS and "law" in known:
         levels = [f"{level} = 0.1" for level in LAWS[key].levels][:1]
         return "; write " + " and ".join([f'law = "{key}"', *levels]) + "."

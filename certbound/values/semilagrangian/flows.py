@@ -20,7 +20,7 @@ import numpy as np
 from certbound.arrays import Mask
 from certbound.problem.model import JUMPS, ROWS, Graph, Tape, jacobian
 from certbound.rigor.intervals import Interval
-from certbound.rigor.series import ZERO, Series, product
+from certbound.rigor.series import ZERO, Series, circular, power, product
 from certbound.values.discrete import evaluate
 from certbound.watch import poll
 
@@ -30,24 +30,38 @@ _ROUNDS = 40
 _ONE = Interval.point(1.0)
 
 
-def series_along(tape: Tape, inputs: Sequence[Series], order: int, products: list[Series]) -> list[Series]:
+def series_along(tape: Tape, inputs: Sequence[Series], order: int, known: list[Series]) -> list[Series]:
     """Taylor coefficients of a tape's outputs, from those of its inputs.
 
-    ``products`` holds those of all products in turn, as a lower order left them; it is brought to this order.
+    ``known`` holds those of all products, sines and cosines in turn, as a lower order left them; it is brought to this
+    order. Of order 0 everything is computed as numbers, not as series, and may be closer by a rounding.
     """
     table: dict[str, Callable[..., Any]] = {op: partial(_applied, op, order) for op in ROWS}
     table["const"] = lambda value: [Interval.point(value)]
-    turn = itertools.count()
+    turn, pairs = itertools.count(), dict[int, tuple[Series, Series]]()
 
-    def times(x: Series, y: Series) -> Series:
+    def before() -> tuple[int, Series]:
         k = next(turn)
-        known = products[k] if k < len(products) else []
-        # of order 0 everything is computed as numbers, not as series, and may be closer by a rounding
-        found = product(x, y, order, known) if len(known) > 1 else _applied("mul", order, x, y)
-        products[k : k + 1] = [found]
+        return k, known[k] if k < len(known) and len(known[k]) > 1 else []
+
+    def times(x: Series, y: Series, highest: int = order) -> Series:
+        k, found = before()
+        found = product(x, y, highest, found) if found else _applied("mul", highest, x, y)
+        known[k : k + 1] = [found]
         return found
 
-    return tape.evaluate(table | {"mul": times}, inputs)
+    def circle(op: str, x: Series) -> Series:
+        if len(x) == 1:
+            return _applied(op, order, x)
+        if id(x) not in pairs:
+            (j, one), (k, two) = before(), before()
+            pairs[id(x)] = circular(x, order, (one, two) if one else None)
+            known[j : j + 1], known[k : k + 1] = ([part] for part in pairs[id(x)])
+        return pairs[id(x)][op == "cos"]
+
+    table |= {"mul": times, "pow": lambda x, exponent: power(x, exponent, order, times)}
+    table |= {op: partial(circle, op) for op in ("sin", "cos")}
+    return tape.evaluate(table, inputs)
 
 
 def _applied(op: str, order: int, *args: Any) -> Series:
@@ -164,8 +178,8 @@ def flow(
     end = []
     for k in range(len(start)):
         total = outer[k][order + 1]
-        for power in range(order, -1, -1):
-            total = inner[k][power] + h * total
+        for degree in range(order, -1, -1):
+            total = inner[k][degree] + h * total
         low = np.where(known, np.maximum(total.lo, way[k].lo), way[k].lo)
         high = np.where(known, np.minimum(total.hi, way[k].hi), way[k].hi)
         fine = np.isfinite(low) & np.isfinite(high) & (low <= high)

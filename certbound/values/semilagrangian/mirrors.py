@@ -314,6 +314,8 @@ def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wi
     ends = np.concatenate([y[:1], y[:-1]]), np.concatenate([y[1:], y[-1:]])
     along, away = np.full(len(y), 1e-9), np.full(len(y), 1.1 * swing)
     fine = np.zeros(len(y), dtype=bool)
+    (p0, p1), (q0, q1) = setting.faces
+    farthest = 100 * (p1 - p0), 100 * (q1 - q0 + swing)  # a model that runs away ends here, and is not fine
     for _ in range(12):
         near = Interval(face - away, face + away)
         end = Interval(*ends) + near * clock.shear
@@ -325,6 +327,7 @@ def _face(setting: Setting, clock: Clock, y: Array, where: tuple[int, float], wi
             break
         grow = ~fine & good
         along, away = np.where(grow, 1.05 * travel, along), np.where(grow, np.maximum(away, 1.05 * needed), away)
+        along, away = np.minimum(along, farthest[0]), np.minimum(away, farthest[1])
     apart = (f.hi[:, 0] - f.lo[:, 0]) * h * _UP
     path = Interval(
         end.lo - np.where(rise > 0, travel, apart), end.hi + np.where(fall < 0, travel, apart)

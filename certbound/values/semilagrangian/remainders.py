@@ -203,8 +203,8 @@ def _strays(
     drift = safe(a[:, 0]) * safe(f[:, 0]) + slope * safe(f[:, 1]) + safe(c[:, 3]) * (0.5 * noise**2)
     middle = np.abs(slope.mid) + slope.rad
     varying = (c.mag[:, 2] > 0) | (c.mag[:, 3] > 0)
-    width = tube[1].hi - tube[1].lo
-    crude = step / 4 * (middle * width + safe(a[:, 0]).mag * (tube[0].hi - tube[0].lo))
+    across, width = (np.where(fine, part.hi - part.lo, 0.0) for part in tube)
+    crude = step / 4 * (middle * width + safe(a[:, 0]).mag * across)
     down = np.where(varying, crude, np.maximum(drift.hi, 0.0) * step**2 / 8)
     over = np.where(varying, crude, np.maximum(-drift.lo, 0.0) * step**2 / 8)
     bow = np.where(varying, 0.0, noise * step**1.5 * middle)
