@@ -296,13 +296,13 @@ def test_the_steps_end_when_the_time_is_over() -> None:
 
 
 def test_a_drift_that_runs_away_beyond_a_face_is_no_fault_of_the_problem() -> None:
-    """A neuron at rest, with steps so long that what may lie beyond its lower face grows without end."""
+    """A neuron at rest, for which what may lie beyond its lower face grows without end."""
     system = cb.ContinuousSystem(
         lambda x: [0.08 * (x[1] + 0.7 - 0.8 * x[0]), x[1] - x[1] ** 3 / 3 - x[0]], states=2, diffusion=[[0.0], [0.1]]
     )
     box = cb.Box([-0.7, -3.0], [0.0, 0.5])
     setting = setting_of(cb.Problem(system, initial=[-0.5, -1.1], safe=[cb.Inside(box)], horizon=1))
-    clock = Clock(step=0.5, count=2, shear=0.0, omega=6.0)
+    clock = Clock(step=0.15, count=10, shear=0.05, omega=6.0)
     face = mirrors._face(setting, clock, np.linspace(-0.7, 0.0, 5), (0, -3.0), 6.0)
     assert np.all(face.most == np.inf)
 
