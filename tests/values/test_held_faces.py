@@ -59,6 +59,16 @@ def test_a_population_that_dies_out_is_bounded_from_both_sides() -> None:
     assert 0.03 < 10**found.lower <= 10**found.upper < min(0.25, 1.15 * 10**found.lower)
 
 
+@pytest.mark.parametrize("gone", [cb.HalfSpace([1], 0), cb.Box([-1], [0])])
+def test_who_is_to_keep_off_a_face_that_no_path_crosses_fails_as_he_touches_it(gone) -> None:
+    """dx = sqrt(x) dW from 1/2 has died out by 2 with probability exp(-1/2); a path stays in x >= 0 for ever."""
+    asked = line(lambda x: [0.0], lambda t, x: [[root(x)]], ([-1.0], [2.0]))
+    found = bound_exits(asked.replace(safe=[*asked.safe, cb.Outside(gone)]), seconds=0.01)
+    assert 10**found.upper >= math.exp(-0.5)
+    near = bound_exits(asked.replace(safe=[*asked.safe, cb.Outside(cb.HalfSpace([1], 1e-2))]), seconds=0.01)
+    assert math.exp(-0.5) < 10**near.upper < 0.9
+
+
 def test_a_share_of_genes_is_bounded_the_same_seen_from_either_end() -> None:
     """The upper face is one at which rounding would leave the root without a value."""
     def g(t, x):

@@ -110,7 +110,10 @@ def _limit(constraint: Inside, side: int, end: float, inner: bool) -> Limit:
         size = abs(end) + abs(middle) if middle or not exact else 0.0
     inward = (1 if side == 0 else -1) * (1 if inner else -1)
     center = region.center if isinstance(region.center, Tape) else None
-    return Limit(side=side, center=center, offset=end + middle + inward * _SLACK * size)
+    offset = end + middle + inward * _SLACK * size
+    if constraint.outside and inner:  # who touches it has failed, also where no path crosses its end
+        offset = float(np.nextafter(offset, inward * np.inf))
+    return Limit(side=side, center=center, offset=offset)
 
 
 def _beside(constraint: Inside, ends: dict[int, float], problem: Problem) -> dict[int, float]:
