@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.problem.sets import Faces, Inside, Quadratic, Region
+from certbound.problem.sets import Faces, Inside, Quadratic, Region, as_stays
 from certbound.rigor.intervals import Interval, sq, stack
 
 
@@ -79,7 +79,7 @@ def inverse_of(matrix: Array) -> Interval:
 def box_around(constraints: Sequence[Inside], dimension: int, step: int) -> tuple[Array, Array]:
     """Ends of a box that contains every safe state, shapes (n,); infinite where nothing bounds a state."""
     low, high = np.full(dimension, -np.inf), np.full(dimension, np.inf)
-    for constraint in constraints:
+    for constraint in as_stays(constraints):
         if constraint.outside:
             continue
         places, around = constraint.region.places(dimension), constraint.region.hull(step)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array, Mask
 from certbound.checks import assign, positive_definite, vector
-from certbound.problem.sets.forms import Region
+from certbound.problem.sets.forms import Faces, Region
+from certbound.problem.sets.regions import Box, HalfSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,7 @@ class Inside:
 
     word: ClassVar[str] = "inside"
     outside: ClassVar[bool] = False
+    open: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if Region not in type(self.region).__bases__:  # a class made from a shape may mean something else
@@ -69,6 +71,43 @@ class Outside(Inside):
 
     word: ClassVar[str] = "outside"
     outside: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, eq=False)
+class Open(Inside):
+    """The state stays in the interior of a region: what a half-space to keep out of leaves (`as_stays`)."""
+
+    open: ClassVar[bool] = True
+
+
+def as_stays(constraints: Sequence[Inside]) -> list[Inside]:
+    """The constraints, half-spaces to keep out of as the sets to stay in that they leave.
+
+    Who is in {n.x <= b} has failed, so that {-n.x < -b} is left. From below its closure does: who leaves that has
+    failed. From above the last float before -b does in place of -b (`inward`), or a proof for which who touches the
+    face has failed: either set lies in what is left, and failing on a larger set is no less probable. Windows stay as
+    they are, and so do centers that move.
+    """
+    return [_stay(one) if one.outside and _single(one.region) else one for one in constraints]
+
+
+def inward(constraint: Inside, side: int, place: float) -> float:
+    """A face that is rounded inward, or where the set is `Open` the next float inside."""
+    return float(np.nextafter(place, np.inf if side == 0 else -np.inf)) if constraint.open else place
+
+
+def _single(region: Region) -> bool:
+    return isinstance(region.form, Faces) and len(region.form.bounds) == 1
+
+
+def _stay(constraint: Inside) -> Open:
+    region, form = constraint.region, constraint.region.form
+    if isinstance(region, Box):
+        low = np.where(np.isfinite(region.high), region.high, -np.inf)
+        region = replace(region, low=low, high=np.where(np.isfinite(region.low), region.low, np.inf))
+    elif isinstance(form, Faces):
+        region = HalfSpace(-form.normals[0], -float(form.bounds[0]))
+    return Open(region, during=constraint.during, label=constraint.label)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.goals import check_end
 from certbound.problem.model import Node, Tape, edged, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box
+from certbound.problem.sets import Box, as_stays
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
@@ -146,7 +146,7 @@ def bound_exits(
         _refuse_random(problem)
         hoped = math.log(delta) if spare and delta > 0 else math.inf
         (upper, words), least = three_states(problem, model, begin + seconds, hoped), None
-    elif moving(problem) and all(not c.outside for c in problem.constraints):
+    elif moving(problem) and all(not c.outside for c in as_stays(problem.constraints)):
         _refuse_random(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
         upper, least, words = bound_moving(problem, model, begin + seconds, wanted)

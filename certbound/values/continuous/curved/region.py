@@ -8,7 +8,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Quadratic
+from certbound.problem.sets import Inside, Quadratic, as_stays
 from certbound.values.continuous.curved.boundaries import Walls
 from certbound.values.continuous.plane import Floats, reach_of
 from certbound.values.continuous.room import faces_of, refuse_windows
@@ -27,7 +27,7 @@ class Region:
 
 def walled(problem: Problem) -> bool:
     """Whether the safe set of a problem in the plane is more than a box: obstacles, other limits, or a missing one."""
-    kept = problem.constraints
+    kept = as_stays(problem.constraints)
     if not boxed(problem):
         return True
     sides = np.vstack([np.eye(2), -np.eye(2)])
@@ -36,7 +36,7 @@ def walled(problem: Problem) -> bool:
 
 def boxed(problem: Problem) -> bool:
     """Whether all limits lie along the coordinates."""
-    return all(not constraint.outside and _square(constraint) for constraint in problem.constraints)
+    return all(not constraint.outside and _square(constraint) for constraint in as_stays(problem.constraints))
 
 
 def _square(constraint: Inside) -> bool:
@@ -58,10 +58,10 @@ def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) ->
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
     around = [np.full(2, -np.inf), np.full(2, np.inf)]
     walls, ends = [], []
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         refuse_windows(constraint, problem)
         if not constraint.outside and _square(constraint):
-            for axis, side, inner, _ in faces_of(constraint.region, constraint.label):
+            for axis, side, inner, _ in faces_of(constraint):
                 if side == 0:
                     low[axis] = max(low[axis], inner)
                 else:

@@ -15,7 +15,7 @@ import numpy as np
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Graph, Tape, arithmetic
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Quadratic
+from certbound.problem.sets import Inside, Quadratic, as_stays
 from certbound.rigor.intervals import Interval
 
 _SLACK = 4e-16
@@ -89,7 +89,7 @@ def limits_of(problem: Problem, *, inner: bool) -> list[tuple[Limit, tuple[float
         An obstacle beside which the start does not stand, or one that appears when paths may be on both sides of it.
     """
     found = []
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         window = constraint.during or (0.0, float(problem.horizon))
         around = constraint.region.extent()
         ends = {0: float(around.lo[0]), 1: float(around.hi[0])}
@@ -111,7 +111,7 @@ def _limit(constraint: Inside, side: int, end: float, inner: bool) -> Limit:
     inward = (1 if side == 0 else -1) * (1 if inner else -1)
     center = region.center if isinstance(region.center, Tape) else None
     offset = end + middle + inward * _SLACK * size
-    if constraint.outside and inner:  # who touches it has failed, also where no path crosses its end
+    if inner and (constraint.outside or constraint.open):  # who touches it has failed, also where no path crosses it
         offset = float(np.nextafter(offset, inward * np.inf))
     return Limit(side=side, center=center, offset=offset)
 

@@ -17,7 +17,7 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Graph, Tape, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside
+from certbound.problem.sets import Inside, as_stays, inward
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Reader
 from certbound.values.continuous.held_faces import check_noise
@@ -48,7 +48,7 @@ def frames_of(problem: Problem, *, inner: bool) -> list[Phase]:
         Windows, obstacles, curved or oblique sets, a state without a limit on both sides, or a box without interior.
     """
     limits: list[list[Limit]] = [[], []]
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         form, moves = constraint.region.form, constraint.region.moving
         if constraint.outside or form.round or (moves and not form.axial):
             raise InfeasibleError(f"value functions serve moving boxes only, not '{constraint.label}'.")
@@ -69,13 +69,13 @@ def _faces(constraint: Inside) -> list[tuple[int, int, float, float, Tape | None
     """(state, side, inner offset, outer offset, centre) of each face of a constraint."""
     region = constraint.region
     if not region.moving:
-        return [(*face, None) for face in faces_of(region, constraint.label)]
+        return [(*face, None) for face in faces_of(constraint)]
     center, around = region.center, region.extent()
     found: list[tuple[int, int, float, float, Tape | None]] = []
     for k, axis in enumerate(region.places(2)):
         own = Tape(inputs=center.inputs, nodes=center.nodes, outputs=(center.outputs[k],), shape=(1,))
         ends = ((0, float(around.lo[k])), (1, float(around.hi[k])))
-        found += [(axis, side, end, end, own) for side, end in ends if np.isfinite(end)]
+        found += [(axis, side, inward(constraint, side, end), end, own) for side, end in ends if np.isfinite(end)]
     return found
 
 
