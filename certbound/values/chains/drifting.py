@@ -18,7 +18,7 @@ from flint import fmpq, fmpq_poly
 
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import HalfSpace, Reach
+from certbound.problem.sets import HalfSpace, Reach, as_stays
 from certbound.problem.systems import DiscreteSystem
 from certbound.values.discrete import FailureBounds, bound_long_run
 from certbound.values.exact import interval_of, polynomial_of
@@ -52,7 +52,7 @@ def bound_by_drift(problem: Problem) -> Drifting:
     if problem.reach is not None or problem.ending or problem.initial.random or len(problem.starts) > 1:
         raise InfeasibleError("a drift bounds problems without a target, from a set of starts.")
     low, high = -math.inf, math.inf
-    for constraint in problem.kept:
+    for constraint in as_stays(problem.kept):
         if constraint.outside or constraint.during not in (None, (0.0, float(problem.horizon))):
             raise InfeasibleError("a drift bounds limits that always hold.")
         first, last = interval_of(constraint.region)

@@ -26,6 +26,7 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
+from certbound.problem.sets import as_stays
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
@@ -238,7 +239,7 @@ def _model(problem: Problem) -> Tape:
 def _ends(problem: Problem) -> tuple[float, float, int]:
     """The failing end and the other one, in y, and the side of the failing one."""
     low, high = -math.inf, math.inf
-    for constraint in problem.kept:
+    for constraint in as_stays(problem.kept) if problem.reach is None else problem.kept:
         if constraint.outside or constraint.during not in (None, (0.0, float(problem.horizon))):
             raise InfeasibleError("value functions of infinite horizons need limits that always hold, no obstacles.")
         first, last = interval_of(constraint.region)
