@@ -7,13 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.problem.sets import Faces, Inside, Quadratic, Region, as_stays
+from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.rigor.intervals import Interval, sq, stack
 
 
 def active_at(constraints: Sequence[Inside], step: int) -> list[Inside]:
     """The constraints that hold at a step."""
     return [c for c in constraints if c.during is None or c.during[0] <= step <= c.during[1]]
+
+
+def as_stays(constraints: Sequence[Inside]) -> list[Inside]:
+    """The constraints, half-spaces to keep out of as what they leave to stay in (`Inside.as_stay`)."""
+    return [constraint.as_stay() for constraint in constraints]
 
 
 def respected(

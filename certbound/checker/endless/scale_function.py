@@ -76,7 +76,8 @@ def _faces_of(constraint: Constraint, sign: int, horizon: float) -> list[_Face]:
     """
     region = constraint.region
     whole = constraint.during in (None, (0.0, horizon))
-    if (not constraint.inside and len(region.bounds) != 1) or region.round or isinstance(region.center, Tape) or not whole:
+    single = constraint.inside or len(region.bounds) == 1
+    if not single or region.round or isinstance(region.center, Tape) or not whole:
         raise Unproved(f"'{constraint.label}' is no interval that always holds and stands still")
     found = []
     for number, bound in enumerate(region.bounds):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, Reach, as_stays, inward
+from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, Reach
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 from certbound.problem.sets.initial import check_start, check_target
@@ -11,7 +11,6 @@ from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Poly
 from certbound.problem.sets.unions import StartUnion
 
 __all__ = [
-    "as_stays",
     "Ball",
     "Box",
     "check_start",
@@ -23,7 +22,6 @@ __all__ = [
     "HalfSpace",
     "Inside",
     "intersection",
-    "inward",
     "Outside",
     "polygon",
     "Polytope",

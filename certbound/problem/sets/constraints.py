@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -36,7 +36,6 @@ class Inside:
 
     word: ClassVar[str] = "inside"
     outside: ClassVar[bool] = False
-    open: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if Region not in type(self.region).__bases__:  # a class made from a shape may mean something else
@@ -58,6 +57,20 @@ class Inside:
         """Whether states, shape (..., n), satisfy the constraint at time t (its window aside)."""
         return np.asarray(self.region.contains(x, t) != self.outside)
 
+    def as_stay(self) -> Inside:
+        """A half-space to keep out of as the set to stay in that it leaves, anything else as it is.
+
+        Who is in {n.x <= b} has failed, so that {-n.x < -b} is left. From below its closure does: who leaves that has
+        failed. From above the last float before -b does in place of -b (`inward`), or a proof for which who touches
+        the face has failed: either set lies in what is left, and failing on a larger set is no less probable. Windows
+        stay as they are, and so do centers that move.
+        """
+        return self
+
+    def inward(self, side: int, place: float) -> float:
+        """A face on a lower (0) or upper side, from within: the next float inside if the set is open."""
+        return place
+
 
 @dataclass(frozen=True, eq=False)
 class Outside(Inside):
@@ -72,42 +85,33 @@ class Outside(Inside):
     word: ClassVar[str] = "outside"
     outside: ClassVar[bool] = True
 
+    def inward(self, side: int, place: float) -> float:
+        return _next(side, place)
+
+
+    def as_stay(self) -> Inside:
+        region, form = self.region, self.region.form
+        if not isinstance(form, Faces) or len(form.bounds) != 1:
+            return self
+        if isinstance(region, Box):
+            low = np.where(np.isfinite(region.high), region.high, -np.inf)
+            region = replace(region, low=low, high=np.where(np.isfinite(region.low), region.low, np.inf))
+        else:
+            region = HalfSpace(-form.normals[0], -float(form.bounds[0]))
+        return Open(region, during=self.during, label=self.label)
+
 
 @dataclass(frozen=True, eq=False)
 class Open(Inside):
-    """The state stays in the interior of a region: what a half-space to keep out of leaves (`as_stays`)."""
+    """The state stays in the interior of a region: what a half-space to keep out of leaves."""
 
-    open: ClassVar[bool] = True
-
-
-def as_stays(constraints: Sequence[Inside]) -> list[Inside]:
-    """The constraints, half-spaces to keep out of as the sets to stay in that they leave.
-
-    Who is in {n.x <= b} has failed, so that {-n.x < -b} is left. From below its closure does: who leaves that has
-    failed. From above the last float before -b does in place of -b (`inward`), or a proof for which who touches the
-    face has failed: either set lies in what is left, and failing on a larger set is no less probable. Windows stay as
-    they are, and so do centers that move.
-    """
-    return [_stay(one) if one.outside and _single(one.region) else one for one in constraints]
+    def inward(self, side: int, place: float) -> float:
+        return _next(side, place)
 
 
-def inward(constraint: Inside, side: int, place: float) -> float:
-    """A face that is rounded inward, or where the set is `Open` the next float inside."""
-    return float(np.nextafter(place, np.inf if side == 0 else -np.inf)) if constraint.open else place
-
-
-def _single(region: Region) -> bool:
-    return isinstance(region.form, Faces) and len(region.form.bounds) == 1
-
-
-def _stay(constraint: Inside) -> Open:
-    region, form = constraint.region, constraint.region.form
-    if isinstance(region, Box):
-        low = np.where(np.isfinite(region.high), region.high, -np.inf)
-        region = replace(region, low=low, high=np.where(np.isfinite(region.low), region.low, np.inf))
-    elif isinstance(form, Faces):
-        region = HalfSpace(-form.normals[0], -float(form.bounds[0]))
-    return Open(region, during=constraint.during, label=constraint.label)
+def _next(side: int, place: float) -> float:
+    """Who touches what is to be avoided has failed, also where no path crosses its face."""
+    return float(np.nextafter(place, np.inf if side == 0 else -np.inf))
 
 
 @dataclass(frozen=True, eq=False)

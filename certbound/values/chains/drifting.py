@@ -18,10 +18,11 @@ from flint import fmpq, fmpq_poly
 
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import HalfSpace, Reach, as_stays
+from certbound.problem.sets import HalfSpace, Reach
 from certbound.problem.systems import DiscreteSystem
 from certbound.values.discrete import FailureBounds, bound_long_run
 from certbound.values.exact import interval_of, polynomial_of
+from certbound.values.sets import as_stays
 
 _ENOUGH = 8.0  # theta M - theta y of the starts
 _SHARES = (1 - 1e-9, 0.9, 0.5)

@@ -16,7 +16,7 @@ from certbound.errors import InfeasibleError
 from certbound.problem.goals import check_end
 from certbound.problem.model import Node, Tape, edged, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box, as_stays
+from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
@@ -36,6 +36,7 @@ from certbound.values.continuous.plane import (
 )  # fmt: skip
 from certbound.values.continuous.room import limits_of, safe_room
 from certbound.values.continuous.surface import Surface
+from certbound.values.sets import as_stays
 
 Proposed = tuple[Surface | tuple[Surface, ...], Payment]
 

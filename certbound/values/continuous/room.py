@@ -9,9 +9,9 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Quadratic, as_stays, inward
+from certbound.problem.sets import Inside, Quadratic
 from certbound.rigor.intervals import Interval
-from certbound.values.sets import contains
+from certbound.values.sets import as_stays, contains
 
 Ends = tuple[float, float]
 
@@ -107,7 +107,7 @@ def faces_of(constraint: Inside) -> list[tuple[int, int, float, float]]:
         exact = region.form.axial and not middle
         size = 0.0 if exact else abs(offset) + abs(middle)
         near, far = _rounded(offset + middle, side, size)
-        faces.append((axis, side, inward(constraint, side, near), far))
+        faces.append((axis, side, constraint.inward(side, near), far))
     return faces
 
 
@@ -121,9 +121,9 @@ def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float,
         high = max(faces[1])
     around = problem.initial.hull()
     if around.hi[0] < low:
-        return [(0, 1, low, max(faces[0]))]
+        return [(0, 1, constraint.inward(1, low), max(faces[0]))]
     if around.lo[0] > high:
-        return [(0, 0, high, min(faces[1]))]
+        return [(0, 0, constraint.inward(0, high), min(faces[1]))]
     raise InfeasibleError(f"the starts must lie on one side of '{constraint.label}'.")
 
 

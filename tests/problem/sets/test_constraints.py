@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, as_stays, inward
+from certbound.problem.sets.constraints import GaussianStart, Inside, Open, Outside
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 
 STATES = ("px", "py", "th")
@@ -80,15 +80,15 @@ def test_a_label_names_the_states_in_their_order() -> None:
 def test_a_half_space_to_keep_out_of_leaves_a_set_to_stay_in(region):
     """Both go together but for points of the face, which fail."""
     kept = Outside(region, during=(1, 2), label="far")
-    (stay,) = as_stays([kept])
-    assert (stay.outside, stay.open, stay.during, stay.label) == (False, True, (1, 2), "far")
+    stay = kept.as_stay()
+    assert (type(stay), stay.during, stay.label) == (Open, (1, 2), "far")
     points = np.random.default_rng(0).normal(size=(500, 1 if region.dimension == 1 and not region.moving else 2))
     for t in (0.0, 1.5):
         np.testing.assert_array_equal(stay.satisfied(points, t), kept.satisfied(points, t))
-    assert inward(stay, 0, 0.0) > 0 > inward(stay, 1, 0.0)
-    assert [inward(Inside(region), side, 0.0) for side in (0, 1)] == [0.0, 0.0]
+    assert stay.inward(0, 0.0) > 0 > stay.inward(1, 0.0)
+    assert [Inside(region).inward(side, 0.0) for side in (0, 1)] == [0.0, 0.0]
 
 
 def test_other_constraints_stay_as_they_are():
     given = [Inside(HalfSpace([1, 0], 1)), Outside(Box([0, 0], [1, np.inf])), Outside(Ball([0, 0], 1))]
-    assert as_stays(given) == given
+    assert [one.as_stay() for one in given] == given

@@ -26,13 +26,13 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
-from certbound.problem.sets import as_stays
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import enclose, squared_diffusion
 from certbound.values.continuous.room import points_of
 from certbound.values.exact import interval_of, polynomial_of
+from certbound.values.sets import as_stays
 
 _CELLS = 2**13
 _ENOUGH = 9.0  # by which Psi has risen from the starts to where the last piece begins

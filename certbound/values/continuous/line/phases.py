@@ -15,8 +15,9 @@ import numpy as np
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Graph, Tape, arithmetic
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Quadratic, as_stays
+from certbound.problem.sets import Inside, Quadratic
 from certbound.rigor.intervals import Interval
+from certbound.values.sets import as_stays
 
 _SLACK = 4e-16
 Side = Tape | float | None
@@ -111,8 +112,8 @@ def _limit(constraint: Inside, side: int, end: float, inner: bool) -> Limit:
     inward = (1 if side == 0 else -1) * (1 if inner else -1)
     center = region.center if isinstance(region.center, Tape) else None
     offset = end + middle + inward * _SLACK * size
-    if inner and (constraint.outside or constraint.open):  # who touches it has failed, also where no path crosses it
-        offset = float(np.nextafter(offset, inward * np.inf))
+    if inner:
+        offset = constraint.inward(side, offset)
     return Limit(side=side, center=center, offset=offset)
 
 

@@ -17,7 +17,7 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Graph, Tape, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, as_stays, inward
+from certbound.problem.sets import Inside
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Reader
 from certbound.values.continuous.held_faces import check_noise
@@ -27,6 +27,7 @@ from certbound.values.continuous.plane.plane_below import bound_plane_below, pla
 from certbound.values.continuous.plane.plane_grids import Pair, Plane
 from certbound.values.continuous.plane.two_sides import BELOW, RATE, bound_plane_above, plane_of, rough_level
 from certbound.values.continuous.room import faces_of, points_of, starts_of
+from certbound.values.sets import as_stays
 from certbound.watch import OutOfTime
 
 _ALONG = 5
@@ -75,7 +76,7 @@ def _faces(constraint: Inside) -> list[tuple[int, int, float, float, Tape | None
     for k, axis in enumerate(region.places(2)):
         own = Tape(inputs=center.inputs, nodes=center.nodes, outputs=(center.outputs[k],), shape=(1,))
         ends = ((0, float(around.lo[k])), (1, float(around.hi[k])))
-        found += [(axis, side, inward(constraint, side, end), end, own) for side, end in ends if np.isfinite(end)]
+        found += [(axis, side, constraint.inward(side, end), end, own) for side, end in ends if np.isfinite(end)]
     return found
 
 

@@ -17,11 +17,11 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import as_stays
 from certbound.values.continuous.plane.plane_grids import Pair, Plane, mean_deviation
 from certbound.values.continuous.plane.plane_reach import reach_of
 from certbound.values.continuous.room import faces_of
 from certbound.values.grids import graded_axis
+from certbound.values.sets import as_stays
 
 _BEYOND = 0.6  # of the paths' extent, where nothing bounds a state
 _LAYER = 0.03  # of the box: how near to a face cells crowd
