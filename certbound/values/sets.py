@@ -16,6 +16,11 @@ def active_at(constraints: Sequence[Inside], step: int) -> list[Inside]:
     return [c for c in constraints if c.during is None or c.during[0] <= step <= c.during[1]]
 
 
+def as_stays(constraints: Sequence[Inside]) -> list[Inside]:
+    """The constraints, half-spaces to keep out of as what they leave to stay in (`Inside.as_stay`)."""
+    return [constraint.as_stay() for constraint in constraints]
+
+
 def respected(
     constraints: Sequence[Inside], boxes: Interval, step: int, *, interiors: bool = False
 ) -> tuple[Mask, Mask]:
@@ -79,7 +84,7 @@ def inverse_of(matrix: Array) -> Interval:
 def box_around(constraints: Sequence[Inside], dimension: int, step: int) -> tuple[Array, Array]:
     """Ends of a box that contains every safe state, shapes (n,); infinite where nothing bounds a state."""
     low, high = np.full(dimension, -np.inf), np.full(dimension, np.inf)
-    for constraint in constraints:
+    for constraint in as_stays(constraints):
         if constraint.outside:
             continue
         places, around = constraint.region.places(dimension), constraint.region.hull(step)

@@ -21,7 +21,7 @@ from certbound.values.continuous.plane.two_sides import plane_of, with_rare
 
 def line(f, g, safe, *, start=0.5, horizon=2.0, states=("x",)):
     system = cb.ContinuousSystem(f, states=list(states), diffusion=g)
-    return cb.Problem(system, initial=[start], safe=[cb.Inside(cb.Box(*safe))], horizon=horizon)
+    return cb.Problem(system, initial=np.ravel(start), safe=[cb.Inside(cb.Box(*safe))], horizon=horizon)
 
 
 def root(x):
@@ -57,6 +57,28 @@ def test_a_population_that_dies_out_is_bounded_from_both_sides() -> None:
     """dx = sqrt(x) dW, absorbed at 0: less than the martingale's .5/2."""
     found = bound_exits(line(lambda x: [0.0], lambda t, x: [[root(x)]], ([-1.0], [2.0])), seconds=0.01)
     assert 0.03 < 10**found.lower <= 10**found.upper < min(0.25, 1.15 * 10**found.lower)
+
+
+@pytest.mark.parametrize("gone", [cb.HalfSpace([1], 0), cb.Box([-1], [0])])
+def test_who_is_to_keep_off_a_face_that_no_path_crosses_fails_as_he_touches_it(gone) -> None:
+    """dx = sqrt(x) dW from 1/2 has died out by 2 with probability exp(-1/2); a path stays in x >= 0 for ever."""
+    asked = line(lambda x: [0.0], lambda t, x: [[root(x)]], ([-1.0], [2.0]))
+    found = bound_exits(asked.replace(safe=[*asked.safe, cb.Outside(gone)]), seconds=0.01)
+    assert 10**found.upper >= math.exp(-0.5)
+    near = bound_exits(asked.replace(safe=[*asked.safe, cb.Outside(cb.HalfSpace([1], 1e-2))]), seconds=0.01)
+    assert math.exp(-0.5) < 10**near.upper < 0.9
+
+
+def test_in_two_states_who_touches_what_is_to_be_avoided_fails_too() -> None:
+    """As before beside another state; who is to stay where x >= 0 reaches 2 first with .25 at most."""
+    def noise(x):
+        return [[root(x), 0 * x[0]], [0 * x[0], 0.2 + 0 * x[0]]]
+
+    asked = line(lambda x: [0 * x[0], -x[1]], noise, ([-1.0, -1.0], [2.0, 1.0]), start=[0.5, 0.0], states=("x", "y"))
+    stays = asked.replace(safe=[*asked.safe, cb.Inside(cb.HalfSpace([-1, 0], 0))])
+    assert 10 ** bound_exits(stays, seconds=0.5).upper < 0.5 < math.exp(-0.5)
+    with pytest.raises(InfeasibleError, match="full rank"):
+        bound_exits(asked.replace(safe=[*asked.safe, cb.Outside(cb.HalfSpace([1, 0], 0))]), seconds=0.5)
 
 
 def test_a_share_of_genes_is_bounded_the_same_seen_from_either_end() -> None:

@@ -1,5 +1,6 @@
 """Infinite horizons where failing is not certain: closed forms, simulation, refusals."""
 
+import json
 import math
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from scipy.integrate import quad
 
 import certbound as cb
+from certbound.checker import check_data
+from certbound.cli.commands.check import proved_certificate
 from certbound.errors import InfeasibleError
 from certbound.values.chains import bound_by_drift, bound_drifting
 from certbound.values.continuous import bound_lasting
@@ -134,3 +137,34 @@ def test_a_walk_without_drift_has_no_bound_below_1():
         bound_by_drift(walk(lambda x: 1.0 * x))
     with pytest.raises(InfeasibleError, match="on one side only"):
         bound_by_drift(walk(lambda x: x + 0.3, safe=[cb.Inside(cb.Box([0.0], [9.0]))]))
+
+
+@pytest.mark.parametrize("system", [drifting(lambda x: 0 * x + 0.5).system, cb.DiscreteSystem(
+    lambda x: x + 0.5, states=["x"], noise=cb.Gaussian(std=1.0))])  # fmt: skip
+def test_a_half_line_to_keep_out_of_is_a_limit(system):
+    kept, left = ([one] for one in (cb.Outside(cb.HalfSpace([1.0], 0.0)), HALF[0]))
+    bound = bound_lasting if system.time == "continuous" else bound_by_drift
+    asked = drifting(lambda x: 0 * x + 0.5, safe=kept, delta=0.5).replace(system=system)
+    found, same = bound(asked), bound(asked.replace(safe=left))
+    assert vars_of(found) == vars_of(same)
+    verdict = cb.verify_safety(asked, method="values")
+    data = json.loads(proved_certificate(asked, verdict))
+    assert check_data(data).log10_proved == pytest.approx(-math.log10(math.e), rel=1e-6)
+    data["problem"]["constraints"][0]["region"]["bound"] = (0.1).hex()
+    assert not check_data(data).valid
+
+
+def vars_of(found):
+    return [getattr(found, name) for name in ("upper", "lower", "rate", "limit", "log") if hasattr(found, name)]
+
+
+def test_an_obstacle_that_begins_where_the_target_does_is_not_forgotten():
+    asked = drifting(lambda x: 0 * x + 0.5, reach=cb.Reach(cb.HalfSpace([-1.0], -3.0)), delta=0.5)
+    verdict = cb.verify_safety(asked, method="values")
+    data = json.loads(proved_certificate(asked, verdict))
+    assert check_data(data).valid
+    region = {"kind": "halfspace", "normal": [(-1.0).hex()], "bound": (-3.0).hex()}
+    data["problem"]["constraints"].append({"kind": "outside", "region": region, "during": None, "label": "x < 3"})
+    assert not check_data(data).valid
+    with pytest.raises(InfeasibleError, match="no obstacles"):
+        bound_lasting(asked.replace(safe=[*HALF, cb.Outside(cb.HalfSpace([-1.0], -4.0))]))

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 import certbound as cb
+from certbound.checker import check_data
+from certbound.cli.commands.check import proved_certificate
+from certbound.problem.files.loading import loads
 from certbound.rigor.intervals import Interval
 from certbound.values.sets import active_at, box_around, contains, respected
 
@@ -58,3 +63,47 @@ def test_obstacles_and_windows_put_no_box_around_anything() -> None:
     constraints = [cb.Outside(cb.Ball([0, 0], 1)), cb.Inside(cb.Box([-1, -1], [1, 1]), during=(2, 3))]
     assert np.isinf(box_around(active_at(constraints, 1), 2, 1)[0]).all()
     assert np.isfinite(box_around(active_at(constraints, 2), 2, 2)[0]).all()
+
+
+def test_a_half_space_to_keep_out_of_bounds_a_state() -> None:
+    low, high = box_around([cb.Outside(cb.HalfSpace([-2, 0], -3)), cb.Outside(cb.HalfSpace([1, 1], 0))], 2, 0)
+    np.testing.assert_allclose(high, [1.5, np.inf])
+    assert np.isinf(low).all()
+
+
+LEVEL = """
+time = "continuous"
+horizon = 2
+states = ["gut", "blood"]
+delta = 0.05
+
+[dynamics]
+gut = "0.3 - 0.3*gut"
+blood = "0.5*gut - 0.5*blood"
+
+[noise]
+diffusion = { gut = "0.2*gut", blood = "0.2*blood" }
+
+[initial]
+point = [1.0, 1.0]
+
+[[avoid]]
+halfspace = { normal = { blood = -1 }, bound = -1.7 }
+
+[[stay]]
+box = { gut = [0.3, 2.5], blood = [0.4, 4] }
+"""
+
+
+def test_a_level_that_is_to_be_avoided_is_a_limit() -> None:
+    """Simulated .015; as a curved wall the limit left .30 after 52 s."""
+    problem = loads(LEVEL)
+    verdict = cb.verify_safety(problem, method="values", time_limit=60)
+    assert verdict.status == "SAFE"
+    data = json.loads(proved_certificate(problem, verdict))
+    report = check_data(data)
+    assert report.valid
+    avoided = [one for one in data["problem"]["constraints"] if one["kind"] == "outside"]
+    assert len(avoided) == 1
+    avoided[0]["region"]["bound"] = (-1.69).hex()  # more is to be avoided than V vanishes at
+    assert not check_data(data).valid

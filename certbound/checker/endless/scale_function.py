@@ -70,15 +70,19 @@ class _Face:
 
 
 def _faces_of(constraint: Constraint, sign: int, horizon: float) -> list[_Face]:
-    """Faces of a constraint as functions of y."""
+    """Faces of a constraint as functions of y: for an obstacle that is one half-space of the closure of what it leaves.
+
+    Who is on the face has failed then: proofs from above count him, and from below only who is beyond it has to fail.
+    """
     region = constraint.region
     whole = constraint.during in (None, (0.0, horizon))
-    if not constraint.inside or region.round or isinstance(region.center, Tape) or not whole:
+    single = constraint.inside or len(region.bounds) == 1
+    if not single or region.round or isinstance(region.center, Tape) or not whole:
         raise Unproved(f"'{constraint.label}' is no interval that always holds and stands still")
     found = []
     for number, bound in enumerate(region.bounds):
-        (slope,) = region.face(number)
-        found.append(_Face(sign * slope, arb(bound) + slope * arb(region.center[0])))
+        (slope,), side = region.face(number), 1 if constraint.inside else -1
+        found.append(_Face(side * sign * slope, side * (arb(bound) + slope * arb(region.center[0]))))
     return found
 
 
@@ -143,6 +147,8 @@ class _Proof:
         sign, horizon = self.sign, self.model.horizon
         faces = [face for constraint in self.model.constraints for face in _faces_of(constraint, sign, horizon)]
         target = [] if self.model.target is None else _faces_of(self.model.target, sign, horizon)
+        if self.model.target is not None and not all(constraint.inside for constraint in self.model.constraints):
+            raise Unproved("an obstacle may begin where the target does")
         if self.above:
             ends = [a] if self.tail is not None else [a, b]
             if not all(face.excess(end) <= 0 for face in faces for end in ends):

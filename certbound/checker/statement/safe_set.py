@@ -118,6 +118,10 @@ class SafeSet:
 
     One that has a window or moves is `Unproved`, and, unless ``bounded`` is False, a state that nothing bounds; then
     there is no ``hull``.
+
+    An obstacle that is one half-space {a.x <= b} bounds states as {a.x >= b} does. `holds` is of the closed set: who
+    asks it counts paths that touch the boundary as failing, so that on what is left a.x > b. `excludes` is of a.x < b,
+    where every point is in the obstacle.
     """
 
     def __init__(self, model: Model, *, bounded: bool = True) -> None:

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from certbound.arrays import Array, Mask
 from certbound.checks import assign, positive_definite, vector
-from certbound.problem.sets.forms import Region
+from certbound.problem.sets.forms import Faces, Region
+from certbound.problem.sets.regions import Box, HalfSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,20 @@ class Inside:
         """Whether states, shape (..., n), satisfy the constraint at time t (its window aside)."""
         return np.asarray(self.region.contains(x, t) != self.outside)
 
+    def as_stay(self) -> Inside:
+        """A half-space to keep out of as the set to stay in that it leaves, anything else as it is.
+
+        Who is in {n.x <= b} has failed, so that {-n.x < -b} is left. From below its closure does: who leaves that has
+        failed. From above the last float before -b does in place of -b (`inward`), or a proof for which who touches
+        the face has failed: either set lies in what is left, and failing on a larger set is no less probable. Windows
+        stay as they are, and so do centers that move.
+        """
+        return self
+
+    def inward(self, side: int, place: float) -> float:
+        """A face on a lower (0) or upper side, from within: the next float inside if the set is open."""
+        return place
+
 
 @dataclass(frozen=True, eq=False)
 class Outside(Inside):
@@ -69,6 +84,33 @@ class Outside(Inside):
 
     word: ClassVar[str] = "outside"
     outside: ClassVar[bool] = True
+
+    def inward(self, side: int, place: float) -> float:
+        return _next(side, place)
+
+    def as_stay(self) -> Inside:
+        region, form = self.region, self.region.form
+        if not isinstance(form, Faces) or len(form.bounds) != 1:
+            return self
+        if isinstance(region, Box):
+            low = np.where(np.isfinite(region.high), region.high, -np.inf)
+            region = replace(region, low=low, high=np.where(np.isfinite(region.low), region.low, np.inf))
+        else:
+            region = HalfSpace(-form.normals[0], -float(form.bounds[0]))
+        return Open(region, during=self.during, label=self.label)
+
+
+@dataclass(frozen=True, eq=False)
+class Open(Inside):
+    """The state stays in the interior of a region: what a half-space to keep out of leaves."""
+
+    def inward(self, side: int, place: float) -> float:
+        return _next(side, place)
+
+
+def _next(side: int, place: float) -> float:
+    """Who touches what is to be avoided has failed, also where no path crosses its face."""
+    return float(np.nextafter(place, np.inf if side == 0 else -np.inf))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from certbound.problem.sets import HalfSpace, Reach
 from certbound.problem.systems import DiscreteSystem
 from certbound.values.discrete import FailureBounds, bound_long_run
 from certbound.values.exact import interval_of, polynomial_of
+from certbound.values.sets import as_stays
 
 _ENOUGH = 8.0  # theta M - theta y of the starts
 _SHARES = (1 - 1e-9, 0.9, 0.5)
@@ -52,7 +53,7 @@ def bound_by_drift(problem: Problem) -> Drifting:
     if problem.reach is not None or problem.ending or problem.initial.random or len(problem.starts) > 1:
         raise InfeasibleError("a drift bounds problems without a target, from a set of starts.")
     low, high = -math.inf, math.inf
-    for constraint in problem.kept:
+    for constraint in as_stays(problem.kept):
         if constraint.outside or constraint.during not in (None, (0.0, float(problem.horizon))):
             raise InfeasibleError("a drift bounds limits that always hold.")
         first, last = interval_of(constraint.region)

@@ -36,6 +36,7 @@ from certbound.values.continuous.plane import (
 )  # fmt: skip
 from certbound.values.continuous.room import limits_of, safe_room
 from certbound.values.continuous.surface import Surface
+from certbound.values.sets import as_stays
 
 Proposed = tuple[Surface | tuple[Surface, ...], Payment]
 
@@ -146,7 +147,7 @@ def bound_exits(
         _refuse_random(problem)
         hoped = math.log(delta) if spare and delta > 0 else math.inf
         (upper, words), least = three_states(problem, model, begin + seconds, hoped), None
-    elif moving(problem) and all(not c.outside for c in problem.constraints):
+    elif moving(problem) and all(not c.outside for c in as_stays(problem.constraints)):
         _refuse_random(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
         upper, least, words = bound_moving(problem, model, begin + seconds, wanted)

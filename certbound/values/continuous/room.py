@@ -9,9 +9,9 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Quadratic, Region
+from certbound.problem.sets import Inside, Quadratic
 from certbound.rigor.intervals import Interval
-from certbound.values.sets import contains
+from certbound.values.sets import as_stays, contains
 
 Ends = tuple[float, float]
 
@@ -60,7 +60,7 @@ def limits_of(problem: Problem) -> Room:
     """
     n = problem.system.dimension
     lows, highs = [[-np.inf] * n, [-np.inf] * n], [[np.inf] * n, [np.inf] * n]
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         refuse_windows(constraint, problem)
         for axis, side, inner, outer in _faces(constraint, problem):
             for place, value in enumerate((inner, outer)):
@@ -86,11 +86,12 @@ def _faces(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, 
     if n > 1 and (constraint.outside or region.form.round):
         count = "two" if n == 2 else "three"
         raise InfeasibleError(f"value functions in {count} states serve boxes only, not '{constraint.label}'.")
-    return _beside(constraint, problem) if constraint.outside else faces_of(region, constraint.label)
+    return _beside(constraint, problem) if constraint.outside else faces_of(constraint)
 
 
-def faces_of(region: Region, label: str) -> list[tuple[int, int, float, float]]:
+def faces_of(constraint: Inside) -> list[tuple[int, int, float, float]]:
     """(state, side, inner place, outer place) of each face of a region whose faces lie along the coordinates."""
+    region = constraint.region
     center = region.center_at()
     if isinstance(region.form, Quadratic):  # in one state
         reach, middle = float(np.sqrt(region.form.matrix[0, 0])), float(center[0])
@@ -100,18 +101,19 @@ def faces_of(region: Region, label: str) -> list[tuple[int, int, float, float]]:
     for normal, bound in zip(region.form.normals, region.form.bounds):
         used = np.flatnonzero(normal)
         if len(used) != 1:
-            raise InfeasibleError(f"value functions serve faces along the coordinates only, not '{label}'.")
+            raise InfeasibleError(f"value functions serve faces along the coordinates only, not '{constraint.label}'.")
         axis, side = region.places(len(normal))[used[0]], int(normal[used[0]] > 0)
         offset, middle = float(bound / normal[used[0]]), float(center[used[0]])
         exact = region.form.axial and not middle
         size = 0.0 if exact else abs(offset) + abs(middle)
-        faces.append((axis, side, *_rounded(offset + middle, side, size)))
+        near, far = _rounded(offset + middle, side, size)
+        faces.append((axis, side, constraint.inward(side, near), far))
     return faces
 
 
 def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, float]]:
     """The face that an obstacle shows to the starts, in one state."""
-    faces = {side: (inner, outer) for _, side, inner, outer in faces_of(constraint.region, constraint.label)}
+    faces = {side: (inner, outer) for _, side, inner, outer in faces_of(constraint)}
     low, high = -np.inf, np.inf  # the obstacle's ends, as far as it has them
     if 0 in faces:
         low = min(faces[0])
@@ -119,9 +121,9 @@ def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float,
         high = max(faces[1])
     around = problem.initial.hull()
     if around.hi[0] < low:
-        return [(0, 1, low, max(faces[0]))]
+        return [(0, 1, constraint.inward(1, low), max(faces[0]))]
     if around.lo[0] > high:
-        return [(0, 0, high, min(faces[1]))]
+        return [(0, 0, constraint.inward(0, high), min(faces[1]))]
     raise InfeasibleError(f"the starts must lie on one side of '{constraint.label}'.")
 
 

@@ -11,7 +11,7 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Graph, Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Faces, Quadratic, Region
+from certbound.problem.sets import Faces, Inside, Quadratic, Region
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval, sq, sqrt
 from certbound.values.continuous import faces_of, starts_of
@@ -183,7 +183,7 @@ def _ends(region: Region, label: str) -> list[tuple[int, int, float, float]]:
             (int(np.argmax(np.abs(row))), int(row.sum() > 0), *2 * (float(bound * row.sum()),))
             for row, bound in zip(rows, form.bounds)
         ]
-    return faces_of(region, label)
+    return faces_of(Inside(region, label=label))
 
 
 def _closed(

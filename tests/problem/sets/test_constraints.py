@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
+from certbound.problem.sets.constraints import GaussianStart, Inside, Open, Outside
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 
 STATES = ("px", "py", "th")
@@ -68,3 +68,27 @@ def test_a_label_names_the_states_in_their_order() -> None:
     names = ("a", "b", "c")
     box = Box([-2.0, -1.0], [2.0, 1.0], coordinates=(2, 0))
     assert Outside(box).named(names).label == "outside -1 <= a <= 1, -2 <= c <= 2"
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        HalfSpace([1, -2], 0.3), Polytope([[0, -3]], [1]), Box([-np.inf, -np.inf], [0.2, np.inf]), Box([0.1], [np.inf]),
+        Box([-np.inf], [0.4], coordinates=[1], center=lambda t: [0.5 * t]),
+    ],
+)
+def test_a_half_space_to_keep_out_of_leaves_a_set_to_stay_in(region):
+    """Both go together but for points of the face, which fail."""
+    kept = Outside(region, during=(1, 2), label="far")
+    stay = kept.as_stay()
+    assert (type(stay), stay.during, stay.label) == (Open, (1, 2), "far")
+    points = np.random.default_rng(0).normal(size=(500, 1 if region.dimension == 1 and not region.moving else 2))
+    for t in (0.0, 1.5):
+        np.testing.assert_array_equal(stay.satisfied(points, t), kept.satisfied(points, t))
+    assert stay.inward(0, 0.0) > 0 > stay.inward(1, 0.0)
+    assert [Inside(region).inward(side, 0.0) for side in (0, 1)] == [0.0, 0.0]
+
+
+def test_other_constraints_stay_as_they_are():
+    given = [Inside(HalfSpace([1, 0], 1)), Outside(Box([0, 0], [1, np.inf])), Outside(Ball([0, 0], 1))]
+    assert [one.as_stay() for one in given] == given

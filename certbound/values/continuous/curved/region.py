@@ -12,6 +12,7 @@ from certbound.problem.sets import Inside, Quadratic
 from certbound.values.continuous.curved.boundaries import Walls
 from certbound.values.continuous.plane import Floats, reach_of
 from certbound.values.continuous.room import faces_of, refuse_windows
+from certbound.values.sets import as_stays
 
 _MARGIN = 0.1  # of the walls' extent: the box reaches beyond them, so that V may be continued there
 _BEYOND = (0.6, 0.25)  # of the paths' extent, where nothing bounds a state, and where the box is to be small
@@ -27,7 +28,7 @@ class Region:
 
 def walled(problem: Problem) -> bool:
     """Whether the safe set of a problem in the plane is more than a box: obstacles, other limits, or a missing one."""
-    kept = problem.constraints
+    kept = as_stays(problem.constraints)
     if not boxed(problem):
         return True
     sides = np.vstack([np.eye(2), -np.eye(2)])
@@ -36,7 +37,7 @@ def walled(problem: Problem) -> bool:
 
 def boxed(problem: Problem) -> bool:
     """Whether all limits lie along the coordinates."""
-    return all(not constraint.outside and _square(constraint) for constraint in problem.constraints)
+    return all(not constraint.outside and _square(constraint) for constraint in as_stays(problem.constraints))
 
 
 def _square(constraint: Inside) -> bool:
@@ -58,10 +59,10 @@ def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) ->
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
     around = [np.full(2, -np.inf), np.full(2, np.inf)]
     walls, ends = [], []
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         refuse_windows(constraint, problem)
         if not constraint.outside and _square(constraint):
-            for axis, side, inner, _ in faces_of(constraint.region, constraint.label):
+            for axis, side, inner, _ in faces_of(constraint):
                 if side == 0:
                     low[axis] = max(low[axis], inner)
                 else:

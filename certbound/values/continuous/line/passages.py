@@ -32,6 +32,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import enclose, squared_diffusion
 from certbound.values.continuous.room import points_of
 from certbound.values.exact import interval_of, polynomial_of
+from certbound.values.sets import as_stays
 
 _CELLS = 2**13
 _ENOUGH = 9.0  # by which Psi has risen from the starts to where the last piece begins
@@ -238,7 +239,7 @@ def _model(problem: Problem) -> Tape:
 def _ends(problem: Problem) -> tuple[float, float, int]:
     """The failing end and the other one, in y, and the side of the failing one."""
     low, high = -math.inf, math.inf
-    for constraint in problem.kept:
+    for constraint in as_stays(problem.kept) if problem.reach is None else problem.kept:
         if constraint.outside or constraint.during not in (None, (0.0, float(problem.horizon))):
             raise InfeasibleError("value functions of infinite horizons need limits that always hold, no obstacles.")
         first, last = interval_of(constraint.region)

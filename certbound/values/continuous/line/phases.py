@@ -17,6 +17,7 @@ from certbound.problem.model import Graph, Tape, arithmetic
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 from certbound.rigor.intervals import Interval
+from certbound.values.sets import as_stays
 
 _SLACK = 4e-16
 Side = Tape | float | None
@@ -89,7 +90,7 @@ def limits_of(problem: Problem, *, inner: bool) -> list[tuple[Limit, tuple[float
         An obstacle beside which the start does not stand, or one that appears when paths may be on both sides of it.
     """
     found = []
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         window = constraint.during or (0.0, float(problem.horizon))
         around = constraint.region.extent()
         ends = {0: float(around.lo[0]), 1: float(around.hi[0])}
@@ -110,7 +111,10 @@ def _limit(constraint: Inside, side: int, end: float, inner: bool) -> Limit:
         size = abs(end) + abs(middle) if middle or not exact else 0.0
     inward = (1 if side == 0 else -1) * (1 if inner else -1)
     center = region.center if isinstance(region.center, Tape) else None
-    return Limit(side=side, center=center, offset=end + middle + inward * _SLACK * size)
+    offset = end + middle + inward * _SLACK * size
+    if inner:
+        offset = constraint.inward(side, offset)
+    return Limit(side=side, center=center, offset=offset)
 
 
 def _beside(constraint: Inside, ends: dict[int, float], problem: Problem) -> dict[int, float]:

@@ -27,6 +27,7 @@ from certbound.values.continuous.plane.plane_below import bound_plane_below, pla
 from certbound.values.continuous.plane.plane_grids import Pair, Plane
 from certbound.values.continuous.plane.two_sides import BELOW, RATE, bound_plane_above, plane_of, rough_level
 from certbound.values.continuous.room import faces_of, points_of, starts_of
+from certbound.values.sets import as_stays
 from certbound.watch import OutOfTime
 
 _ALONG = 5
@@ -48,7 +49,7 @@ def frames_of(problem: Problem, *, inner: bool) -> list[Phase]:
         Windows, obstacles, curved or oblique sets, a state without a limit on both sides, or a box without interior.
     """
     limits: list[list[Limit]] = [[], []]
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         form, moves = constraint.region.form, constraint.region.moving
         if constraint.outside or form.round or (moves and not form.axial):
             raise InfeasibleError(f"value functions serve moving boxes only, not '{constraint.label}'.")
@@ -69,13 +70,13 @@ def _faces(constraint: Inside) -> list[tuple[int, int, float, float, Tape | None
     """(state, side, inner offset, outer offset, centre) of each face of a constraint."""
     region = constraint.region
     if not region.moving:
-        return [(*face, None) for face in faces_of(region, constraint.label)]
+        return [(*face, None) for face in faces_of(constraint)]
     center, around = region.center, region.extent()
     found: list[tuple[int, int, float, float, Tape | None]] = []
     for k, axis in enumerate(region.places(2)):
         own = Tape(inputs=center.inputs, nodes=center.nodes, outputs=(center.outputs[k],), shape=(1,))
         ends = ((0, float(around.lo[k])), (1, float(around.hi[k])))
-        found += [(axis, side, end, end, own) for side, end in ends if np.isfinite(end)]
+        found += [(axis, side, constraint.inward(side, end), end, own) for side, end in ends if np.isfinite(end)]
     return found
 
 

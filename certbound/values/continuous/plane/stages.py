@@ -21,6 +21,7 @@ from certbound.values.continuous.plane.plane_grids import Pair, Plane, mean_devi
 from certbound.values.continuous.plane.plane_reach import reach_of
 from certbound.values.continuous.room import faces_of
 from certbound.values.grids import graded_axis
+from certbound.values.sets import as_stays
 
 _BEYOND = 0.6  # of the paths' extent, where nothing bounds a state
 _LAYER = 0.03  # of the box: how near to a face cells crowd
@@ -57,11 +58,11 @@ def stages_of(problem: Problem, plane: Plane, *, inner: bool) -> list[Stage]:
         Obstacles, moving, curved or oblique sets, constraints at time 0 alone, or a box or a gate without interior.
     """
     limits, whole = list[Limit](), (0.0, float(problem.horizon))
-    for constraint in problem.constraints:
+    for constraint in as_stays(problem.constraints):
         if constraint.outside or constraint.region.form.round or constraint.region.moving:
             raise InfeasibleError(f"value functions over windows serve fixed boxes only, not '{constraint.label}'.")
         window = (whole[0], whole[1]) if constraint.during is None else constraint.during
-        faces = faces_of(constraint.region, constraint.label)
+        faces = faces_of(constraint)
         limits += [(axis, side, near if inner else far, window) for axis, side, near, far in faces]
     last = max(window[1] for *_, window in limits)
     if any(window[1] == 0 for *_, window in limits):

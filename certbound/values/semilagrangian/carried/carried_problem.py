@@ -106,7 +106,7 @@ def voyage_of(problem: Problem) -> Voyage:
     tape = reordered(problem.closed_loop, order)
     starts = starts_of(problem)
     stays, obstacles, limits = _limits(problem, noisy)
-    low, high = box_around([c for c in problem.constraints if not c.outside], STATES, 0)
+    low, high = box_around(problem.constraints, STATES, 0)
     low[noisy], high[noisy] = limits
     ends = [(float(low[k]), float(high[k])) for k in order]
     begun = tuple(starts[k] for k in order)
@@ -134,7 +134,7 @@ def _limits(problem: Problem, noisy: int) -> tuple[list[Region], list[Region], E
                 (obstacles if outside else stays).append(region)
                 continue
             _check_alone(region, constraint, noisy, outside)
-            for _, side, near, _ in faces_of(region, constraint.label):
+            for _, side, near, _ in faces_of(Inside(region, label=constraint.label)):
                 ends[side] = (max, min)[side](ends[side], near)
     return stays, obstacles, (ends[0], ends[1])
 
