@@ -32,7 +32,6 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
-from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
@@ -277,9 +276,9 @@ def _corrected(
         needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / small
         paid = float(needed.max(axis=(1, 2)) @ surface.steps)
         if rare:  # as a share of U and what it is at the starts
-            share = needed / (_least(surface, small) + value)
-            paid = min(paid, 2 * value * float(share.max(axis=(1, 2)) @ surface.steps))
-            needed = np.maximum(needed - _SPARED / plane.horizon * _least(surface, small), 0.0)
+            own = _least(surface, small)
+            paid = min(paid, 2 * value * float((needed / (own + value)).max(axis=(1, 2)) @ surface.steps))
+            needed = np.maximum(needed - _SPARED / plane.horizon * own, 0.0)
         if not math.isfinite(paid) or value <= 0:
             break
         if best[0] is None or sign * (value - best[3]) + paid < 0:
@@ -297,6 +296,8 @@ def _more(source: Source | None, surface: Surface, needed: Array) -> Source:
 
 
 def _least(surface: Surface, small: float) -> Array:
-    """The least U of each patch, 0 where it is less."""
-    low = [value_range(surface.patches(*chunk))[0] for chunk in surface.chunks()]
-    return np.maximum(1 + np.concatenate(low) / small, 0.0).reshape(surface.slabs, *surface.cells)
+    """About the least U of each patch, that at its corners; 0 where it is less."""
+    low = surface.values[:, :, 0, :, 0]
+    for axis in range(3):
+        low = np.minimum(np.delete(low, -1, axis), np.delete(low, 0, axis))
+    return np.maximum(1 + low / small, 0.0)
