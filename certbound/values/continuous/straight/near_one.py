@@ -57,7 +57,8 @@ _RARELY = 0.0065  # about the seconds of one of them, over cells^2
 _FAR = 1.0  # of log P above a rough guess: logarithms may do better
 _FINE = 30  # cells along each state, without which nothing comes of it
 _LONG = {True: 0.02, False: 0.012}  # a ramp's share of the horizon then: fronts start as wide as cells
-_NEARLY = 0.06  # of log P: what is left to pay is no more
+_NEARLY = 0.1  # of log P: what is left to pay is no more
+_SAMPLED = 0.2  # of U where failing is rare: with less to pay samples have told what they can
 _SPARED = 0.03  # of U, which need not be carried then
 _VAIN = 0.1  # of the cost, of a proposal that is not proved
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
@@ -283,7 +284,7 @@ def _corrected(
             break
         if best[0] is None or sign * (value - best[3]) + paid < 0:
             best = surface, source, value, value + sign * paid
-        if factor is None or paid < 2 * _LEFT * value or paid > _WORSE * least:
+        if factor is None or paid < (_SAMPLED if rare else 2 * _LEFT) * value or paid > _WORSE * least:
             break
         least = min(least, paid)
         source = _more(source, surface, factor * needed)
