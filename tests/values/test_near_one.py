@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import time
@@ -30,6 +31,7 @@ from certbound.values.continuous.residual import bound_ranges, sample_in_plane
 from certbound.values.continuous.room import safe_room, starts_of
 from certbound.values.continuous.straight import near_one, ramps, relative
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
+from certbound.watch import OutOfTime
 
 
 def free() -> cb.Problem:
@@ -213,3 +215,42 @@ def test_what_is_bounded_without_q2_holds_with_it() -> None:
     assert np.all(found.residual_high >= sample_in_plane(*full, upper=True))
     assert np.all(found.residual_low <= -sample_in_plane(*full, upper=False))
     assert np.all(found.energy == 0)
+
+
+def test_what_is_proved_where_failing_is_rare_stays_as_time_ends_and_grids_keep_to_it(monkeypatch) -> None:
+    inner, model = plane(free())
+    shares = [-1.0]
+
+    def proved(_: object) -> float:
+        if not shares:
+            raise OutOfTime
+        return shares.pop()
+
+    monkeypatch.setattr(near_one, "relative_below", proved)
+    assert near_one.rarely(inner, model, 8, 0.0, None, below=True) == -1.0
+    with pytest.raises(OutOfTime):
+        near_one.rarely(inner, model, 8, 0.0, None, below=True)
+    cells, found = list[int](), {False: -9.0, True: -9.5}
+
+    def bounded(plane: Plane, model: Model, count: int, level: float, points: object, *, below: bool) -> float:
+        cells.append(count)
+        if below not in found:
+            raise OutOfTime
+        return found[below]
+
+    def ask(guesses: list[float] | None, wanted: float = -10.0) -> tuple[float, float | None]:
+        cells.clear()
+        other = functools.partial(pytest.fail, "logarithms are not asked")
+        return near_one._with_rare(free(), model, (inner, inner), 20.0, -9.1, wanted, other, True, guesses)[:2]
+
+    monkeypatch.setattr(near_one, "rarely", bounded)
+    assert ask(None) == (-9.0, -9.5)
+    assert near_one._RARELY * sum(count**2 for count in cells) < 1.03 * 20.0
+    guesses: list[float] = []
+    assert ask(guesses) == (-9.0, None)
+    assert (guesses, len(cells)) == ([-9.1], 1)
+    del found[True]
+    assert ask(None) == (-9.0, None)
+    found.clear()
+    with pytest.raises(OutOfTime):
+        ask(None)

@@ -7,7 +7,6 @@ shrinks by its factor from one pass to the next. The last one is bounded on ever
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -52,8 +51,8 @@ _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noise
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0, 2.0)  # both where failing is rare
-_ABOVE, _BELOW = 0.82, 1.05  # of what may be spent, for each bound then
-_RARELY = 0.0065  # about the seconds of one of them, over cells^2
+_FIRST, _ABOVE, _BELOW = 0.5, 0.44, 0.56  # of what may be spent, for logarithms; of the rest, for each bound then
+_RARELY = 0.0035  # about the seconds of one of them, over cells^2
 _FAR = 1.0  # of log P above a rough guess: logarithms may do better
 _FINE = 30  # cells along each state, without which nothing comes of it
 _LONG = {True: 0.02, False: 0.012}  # a ramp's share of the horizon then: fronts start as wide as cells
@@ -70,9 +69,13 @@ _ENOUGH = 0.25  # and nothing else is tried
 
 
 def bound_plane(
-    problem: Problem, model: Model, room: Room, deadline: float, wanted: float, *, above: bool = True
+    problem: Problem, model: Model, room: Room, deadline: float, wanted: float, *, above: bool = True,
+    guesses: list[float] | None = None,
 ) -> Found:
-    """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
+    """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare.
+
+    ``guesses`` gets a rough one at log P where a lower bound takes a proof of its own, which is left out then.
+    """
     inner = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     outer = replace(inner, low=_pair(room.outer_low), high=_pair(room.outer_high))
     other = partial(two_states, problem, model, room)
@@ -81,12 +84,12 @@ def bound_plane(
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
     if wanted < math.inf:
         check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
-    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above)
+    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above, guesses=guesses)
 
 
 def bound_between(
     problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other,
-    *, looked: bool = True,
+    *, looked: bool = True, guesses: list[float] | None = None,
 ) -> Found:
     """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due."""
     granted = round(deadline - time.perf_counter(), 1)
@@ -95,7 +98,7 @@ def bound_between(
     if not served or not _RARE < level < 0:
         rare = served and _RAREST < level <= _RARE and round(math.sqrt(_ABOVE * granted / _RARELY)) >= _FINE
         if rare:
-            return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked)
+            return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked, guesses)
         return other(time.perf_counter() + granted, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below, hopes = list[Proposed](), list[Proposed](), list[float]()
@@ -142,32 +145,38 @@ def bound_between(
 
 def _with_rare(
     problem: Problem, model: Model, boxes: tuple[Plane, Plane | None], granted: float, level: float, wanted: float,
-    other: Other, looked: bool,
+    other: Other, looked: bool, guesses: list[float] | None,
 ) -> Found:
     """Both bounds where failing is rare: by logarithms, which certificates state, where these may do for ``wanted``.
 
     Then shares of U are paid, first from above if that is ``looked`` for, and logarithms serve where that fails.
     """
-    inner, outer = boxes
-    cells = [round(math.sqrt(share * granted / _RARELY)) for share in (_ABOVE, _BELOW)]
+    inner, outer = boxes if guesses is None else (boxes[0], None)
     upper, least, words = 0.0, None, "value function in two states, cells: "
     proposed = list[Proposed](), list[Proposed]()
-    if looked and wanted >= level - _LIKELY:
-        upper, least, words, proposed = other(time.perf_counter() + granted, math.inf)
+    if looked and wanted >= level:
+        upper, least, words, proposed = other(time.perf_counter() + _FIRST * granted, math.inf)
         if upper <= wanted:
             return upper, least, words, proposed
-        words += ", "
-    with contextlib.suppress(OutOfTime):
+        words, granted = f"{words}, ", (1 - _FIRST) * granted
+    cells = [round(math.sqrt(share * granted / _RARELY)) for share in (_ABOVE, _BELOW)]
+    try:
         if looked:
             found = rarely(inner, model, cells[0], level, None, below=False)
             upper, words = min(upper, 0.0 if found is None else found), f"{words}{cells[0]}^2"
+        if upper > wanted and guesses is not None:
+            guesses.append(level)
         if upper > wanted and outer is not None and wanted < math.inf:
             least = rarely(outer, model, cells[1], level, points_of(problem), below=True)
             words += f", {cells[1]}^2 below"
+    except OutOfTime:
+        if upper == 0:
+            raise
+        return upper, least, words, proposed
     done = not looked or upper <= wanted or upper < level + _FAR
     if done and (least is not None or upper <= wanted or outer is None or wanted == math.inf):
         return upper, least, words, proposed
-    logs = other(time.perf_counter() + granted, wanted)
+    logs = other(time.perf_counter() + _FIRST * granted, wanted)
     least = max((one for one in (least, logs[1]) if one is not None), default=None)
     return min(upper, logs[0]), least, f"{words} and {logs[2].rpartition('cells: ')[2]}", logs[3]
 
@@ -215,17 +224,21 @@ def rarely(
     if chosen is None:
         return None
     value, solver, surface, source = chosen
-    for factor in (*_GENTLY[1], None):
-        spare, left = NEGLIGIBLE * solver.small * value, _SPARED / plane.horizon * _least(surface, solver.small)
-        given = surface, model, plane.starts, spare, solver.small * left
-        proof = seen_below(*given, points, plane.cut) if below else seen_above(*given)
-        share = relative_below(proof) if below else relative_above(proof)
-        best += [] if share is None else [share]
-        table = _needed(proof, surface, solver.small, below=below)
-        if factor is None or table is None or (best and abs(best[-1] - math.log(value)) < _NEARLY):
-            break
-        source = _more(source, surface, factor * np.maximum(table - left, 0.0))
-        surface = solver.surface(source, below=below)
+    try:
+        for factor in (*_GENTLY[1], None):
+            spare, left = NEGLIGIBLE * solver.small * value, _SPARED / plane.horizon * _least(surface, solver.small)
+            given = surface, model, plane.starts, spare, solver.small * left
+            proof = seen_below(*given, points, plane.cut) if below else seen_above(*given)
+            share = relative_below(proof) if below else relative_above(proof)
+            best += [] if share is None else [share]
+            table = _needed(proof, surface, solver.small, below=below)
+            if factor is None or table is None or (best and abs(best[-1] - math.log(value)) < _NEARLY):
+                break
+            source = _more(source, surface, factor * np.maximum(table - left, 0.0))
+            surface = solver.surface(source, below=below)
+    except OutOfTime:
+        if not best:
+            raise
     return (max if below else min)(best, default=None)
 
 
