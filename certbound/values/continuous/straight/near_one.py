@@ -54,7 +54,7 @@ _GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0, 2.0)  # both where failing is rare
 _FIRST, _ABOVE, _BELOW = 0.5, 0.44, 0.56  # of what may be spent, for logarithms; of the rest, for each bound then
 _RARELY = 0.0035  # about the seconds of one of them, over cells^2
 _FAR = 1.0  # of log P above a rough guess: logarithms may do better
-_FINE = 30  # cells along each state, without which nothing comes of it
+_FINE = 34  # cells along each state, without which nothing comes of it
 _LONG = {True: 0.02, False: 0.012}  # a ramp's share of the horizon then: fronts start as wide as cells
 _NEARLY = 0.1  # of log P: what is left to pay is no more
 _SAMPLED = 0.2  # of U where failing is rare: with less to pay samples have told what they can
@@ -96,8 +96,7 @@ def bound_between(
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
     level = rough_level(inner)
     if not served or not _RARE < level < 0:
-        rare = served and _RAREST < level <= _RARE and round(math.sqrt(_ABOVE * granted / _RARELY)) >= _FINE
-        if rare:
+        if served and _RAREST < level <= _RARE and granted >= _RARELY * _FINE**2:
             return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked, guesses)
         return other(time.perf_counter() + granted, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
@@ -154,12 +153,16 @@ def _with_rare(
     inner, outer = boxes if guesses is None else (boxes[0], None)
     upper, least, words = 0.0, None, "value function in two states, cells: "
     proposed = list[Proposed](), list[Proposed]()
+    room = granted / (_RARELY * _FINE**2)
     if looked and wanted >= level:
-        upper, least, words, proposed = other(time.perf_counter() + _FIRST * granted, math.inf)
-        if upper <= wanted:
+        share = _FIRST if room * (1 - _FIRST) >= 1 else 1.0
+        upper, least, words, proposed = other(time.perf_counter() + share * granted, math.inf)
+        if upper <= wanted or share == 1:
             return upper, least, words, proposed
-        words, granted = f"{words}, ", (1 - _FIRST) * granted
-    cells = [round(math.sqrt(share * granted / _RARELY)) for share in (_ABOVE, _BELOW)]
+        words, granted, room = f"{words}, ", (1 - share) * granted, (1 - share) * room
+    shares = (_ABOVE, _BELOW) if room * _ABOVE >= 1 else (1.0, 1.0)
+    cells = [round(math.sqrt(share * granted / _RARELY)) for share in shares]
+    outer = outer if shares[0] < 1 or not looked else None  # one bound or none
     try:
         if looked:
             found = rarely(inner, model, cells[0], level, None, below=False)
@@ -169,16 +172,15 @@ def _with_rare(
         if upper > wanted and outer is not None and wanted < math.inf:
             least = rarely(outer, model, cells[1], level, points_of(problem), below=True)
             words += f", {cells[1]}^2 below"
+        done = not looked or upper <= wanted or upper < level + _FAR
+        if not done or (least is None and upper > wanted and outer is not None and wanted < math.inf):
+            logs = other(time.perf_counter() + _FIRST * granted, wanted)
+            least = max((one for one in (least, logs[1]) if one is not None), default=None)
+            upper, words, proposed = min(upper, logs[0]), f"{words} and {logs[2].rpartition('cells: ')[2]}", logs[3]
     except OutOfTime:
-        if upper == 0:
+        if upper == 0 and least is None:
             raise
-        return upper, least, words, proposed
-    done = not looked or upper <= wanted or upper < level + _FAR
-    if done and (least is not None or upper <= wanted or outer is None or wanted == math.inf):
-        return upper, least, words, proposed
-    logs = other(time.perf_counter() + _FIRST * granted, wanted)
-    least = max((one for one in (least, logs[1]) if one is not None), default=None)
-    return min(upper, logs[0]), least, f"{words} and {logs[2].rpartition('cells: ')[2]}", logs[3]
+    return upper, least, words, proposed
 
 
 def _pair(ends: tuple[float, ...]) -> tuple[float, float]:
