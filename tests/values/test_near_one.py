@@ -15,7 +15,7 @@ import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.safety.answers import Request
 from certbound.safety.portfolio import ENGINES
-from certbound.values.continuous import exits, straight
+from certbound.values.continuous import exits, residual, straight
 from certbound.values.continuous.curved import bounding
 from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import (
@@ -170,6 +170,16 @@ def test_where_failing_is_rare_a_share_of_u_is_paid(monkeypatch) -> None:
     monkeypatch.setattr(relative, "top_of", lambda _: 0.5)
     higher = relative_below(proof)  # where V may be .5, what is missing counts e^.5 times
     assert higher is None or higher < found[0][1] - 1e-3
+
+
+def test_coarse_bounds_of_what_polynomials_leave_out_are_above_close_ones() -> None:
+    inner, _ = plane(free())
+    smooth = ramps.Ramps(inner, 4, 0.1, below=True).surface(None, below=True)
+    patches = dataclasses.replace(smooth, values=300 * smooth.values).patches(0, smooth.slabs)
+    left_out = np.random.default_rng(1).random((4, len(patches.size)))
+    _, sizes = residual._errors(patches, left_out, 2)
+    assert np.all(residual._coarsely(patches, left_out, sizes) >= residual._diffusive_loss(patches, left_out, 2))
+    assert all(np.all(size >= residual._steepest(patches, axis)) for axis, size in enumerate(sizes))
 
 
 @pytest.mark.slow
