@@ -214,6 +214,25 @@ def test_where_failing_is_rare_q2_is_left_out_and_shares_are_paid_on_both_sides(
     assert found[False][0] < truth + 0.5
 
 
+@pytest.mark.parametrize("below", [True, False])
+def test_where_nothing_is_lost_shares_of_u_say_what_the_values_do(below: bool) -> None:
+    inner, model = plane(free())
+    solver = ramps.Ramps(inner, 8, 0.1, below=below, finely=True)
+    surface = solver.surface(None, below=below)
+    given = surface, model, inner.starts, 1e-6 * solver.small, np.zeros((surface.slabs, *surface.cells))
+    proof = seen_below(*given, None, inner.cut) if below else seen_above(*given)
+    nothing = np.zeros(len(proof.slab))
+    ranges = dataclasses.replace(proof.ranges, residual_low=nothing, residual_high=nothing)
+    proof = dataclasses.replace(proof, ranges=ranges)
+    assert proof.seen is not None
+    surface, need = proof.seen
+    end = need.bottom if below else float(surface.range_at(-1)[0].min())
+    said = math.log((math.exp(need.start) - math.exp(end)) / (1 - math.exp(end)))
+    found = relative_below(proof) if below else relative_above(proof)
+    assert found is not None
+    assert 0 <= (said - found if below else found - said) < 1e-3
+
+
 def test_what_is_bounded_without_q2_holds_with_it() -> None:
     inner, model = plane(free())
     smooth = ramps.Ramps(inner, 4, 0.1, below=True).surface(None, below=True)
