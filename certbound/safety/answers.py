@@ -108,6 +108,8 @@ class EngineAnswer:
         Whether no other engine can do much better: slow refinements of others may be left out.
     truncated : bool
         Whether an ellipsoid of starts stands for a random start, whose other values count as failing.
+    hoped : float or None
+        About log10 of the lower bound that a request from ``below`` would lead to; none was looked for.
     """
 
     log10_delta: float = 0.0
@@ -129,6 +131,7 @@ class EngineAnswer:
     details: Any = None
     conclusive: bool = False
     truncated: bool = False
+    hoped: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -141,7 +144,7 @@ class Request:
     again where that matters, with the ``details`` of its first answer as ``before``. ``bounded``: some probability
     below 1 is proved, and what has no hope of delta may be left out. ``first``: it may end with the first bound that it
     finds, and goes on from there when it is asked again. ``at_length``: all the time that is left is its own.
-    ``below``: a lower bound is all that is wanted, where that is less work.
+    ``below``: a lower bound is all that is wanted, where that is less work; ``above``: an upper one.
     ``found`` takes an answer that holds already while the engine looks for a better one: it stands where time ends the
     search (`certbound.watch`).
     """
@@ -155,6 +158,7 @@ class Request:
     bounded: bool = False
     at_length: bool = False
     below: bool = False
+    above: bool = False
     before: Any = None
     found: Callable[[EngineAnswer], object] = lambda answer: None
 

@@ -28,7 +28,15 @@ from certbound.values.continuous.plane.plane_below import bound_plane_below, pla
 from certbound.values.continuous.plane.plane_grids import Plan, Source
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.plane.solver import weakened
-from certbound.values.continuous.polynomials import basis_at, interpolation, node_product, nodes_of, to_bernstein
+from certbound.values.continuous.polynomials import (
+    CUBIC_HERMITE,
+    HERMITE,
+    basis_at,
+    interpolation,
+    node_product,
+    nodes_of,
+    to_bernstein,
+)  # fmt: skip
 from certbound.values.continuous.proposal import Splines, through
 from certbound.values.continuous.residual import bound_ranges
 from certbound.values.continuous.room import safe_room, starts_of
@@ -85,6 +93,27 @@ def random_surface(rng, axes, slabs, size=1.0):
 
 
 # enclosures
+
+
+def test_coefficients_of_two_states_and_their_size_are_those_of_the_hermite_matrices() -> None:
+    rng = np.random.default_rng(0)
+    axes, times = (np.cumsum(rng.random(4)), np.cumsum(rng.random(3))), np.cumsum(rng.random(3))
+    values, *rates = (rng.normal(size=(count, 4, 3, 3, 3)) for count in (3, 2, 2))
+    surface = Surface(axes=axes, times=times, values=values, start_rates=rates[0], end_rates=rates[1])
+    found = surface.patches(0, 2)
+    for patch, (k, i, j) in enumerate(np.ndindex(2, 3, 2)):
+        parts = np.array([values[k], rates[0][k], values[k + 1], rates[1][k]])[:, i : i + 2, :, j : j + 2]
+        data = parts.reshape(4, 6, 6)
+        reference = data[0, 0, 0]
+        data[::2, ::3, ::3] -= reference
+        data[1::2] *= surface.steps[k]
+        x, y = (np.tile(np.diff(axis)[c] ** np.arange(3), 2) for axis, c in zip(axes, (i, j)))
+        data *= x[:, None] * y
+        matrices = CUBIC_HERMITE, HERMITE, HERMITE
+        assert np.allclose(found.coefficients[patch], np.einsum("at,bx,cy,txy->abc", *matrices, data), atol=1e-14)
+        size = np.einsum("at,bx,cy,txy->abc", *map(np.abs, matrices), np.abs(data)).max()
+        assert found.size[patch] == pytest.approx(size, rel=1e-14)
+        assert found.reference[patch] == reference
 
 
 @pytest.mark.parametrize("count", [1, 5, 9, 11])

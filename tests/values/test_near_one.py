@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import time
@@ -14,7 +15,7 @@ import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.safety.answers import Request
 from certbound.safety.portfolio import ENGINES
-from certbound.values.continuous import exits, straight
+from certbound.values.continuous import exits, residual, straight
 from certbound.values.continuous.curved import bounding
 from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import (
@@ -30,6 +31,7 @@ from certbound.values.continuous.residual import bound_ranges, sample_in_plane
 from certbound.values.continuous.room import safe_room, starts_of
 from certbound.values.continuous.straight import near_one, ramps, relative
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
+from certbound.watch import OutOfTime
 
 
 def free() -> cb.Problem:
@@ -165,9 +167,19 @@ def test_where_failing_is_rare_a_share_of_u_is_paid(monkeypatch) -> None:
     assert found[0][1] is not None
     assert found[0][1] > (-math.inf if found[0][0] is None else found[0][0].log) - 5e-3
     _, proof = proved_lower(surface, model, inner.starts, negligible=1e-6)
-    monkeypatch.setattr(relative, "value_range", lambda patches: (patches.size, np.full(len(patches.size), 0.5)))
+    monkeypatch.setattr(relative, "top_of", lambda _: 0.5)
     higher = relative_below(proof)  # where V may be .5, what is missing counts e^.5 times
     assert higher is None or higher < found[0][1] - 1e-3
+
+
+def test_coarse_bounds_of_what_polynomials_leave_out_are_above_close_ones() -> None:
+    inner, _ = plane(free())
+    smooth = ramps.Ramps(inner, 4, 0.1, below=True).surface(None, below=True)
+    patches = dataclasses.replace(smooth, values=300 * smooth.values).patches(0, smooth.slabs)
+    left_out = np.random.default_rng(1).random((4, len(patches.size)))
+    _, sizes = residual._errors(patches, left_out, 2)
+    assert np.all(residual._coarsely(patches, left_out, sizes) >= residual._diffusive_loss(patches, left_out, 2))
+    assert all(np.all(size >= residual._steepest(patches, axis)) for axis, size in enumerate(sizes))
 
 
 @pytest.mark.slow
@@ -202,6 +214,25 @@ def test_where_failing_is_rare_q2_is_left_out_and_shares_are_paid_on_both_sides(
     assert found[False][0] < truth + 0.5
 
 
+@pytest.mark.parametrize("below", [True, False])
+def test_where_nothing_is_lost_shares_of_u_say_what_the_values_do(below: bool) -> None:
+    inner, model = plane(free())
+    solver = ramps.Ramps(inner, 8, 0.1, below=below, finely=True)
+    surface = solver.surface(None, below=below)
+    given = surface, model, inner.starts, 1e-6 * solver.small, np.zeros((surface.slabs, *surface.cells))
+    proof = seen_below(*given, None, inner.cut) if below else seen_above(*given)
+    nothing = np.zeros(len(proof.slab))
+    ranges = dataclasses.replace(proof.ranges, residual_low=nothing, residual_high=nothing)
+    proof = dataclasses.replace(proof, ranges=ranges)
+    assert proof.seen is not None
+    surface, need = proof.seen
+    end = need.bottom if below else float(surface.range_at(-1)[0].min())
+    said = math.log((math.exp(need.start) - math.exp(end)) / (1 - math.exp(end)))
+    found = relative_below(proof) if below else relative_above(proof)
+    assert found is not None
+    assert 0 <= (said - found if below else found - said) < 1e-3
+
+
 def test_what_is_bounded_without_q2_holds_with_it() -> None:
     inner, model = plane(free())
     smooth = ramps.Ramps(inner, 4, 0.1, below=True).surface(None, below=True)
@@ -213,3 +244,42 @@ def test_what_is_bounded_without_q2_holds_with_it() -> None:
     assert np.all(found.residual_high >= sample_in_plane(*full, upper=True))
     assert np.all(found.residual_low <= -sample_in_plane(*full, upper=False))
     assert np.all(found.energy == 0)
+
+
+def test_what_is_proved_where_failing_is_rare_stays_as_time_ends_and_grids_keep_to_it(monkeypatch) -> None:
+    inner, model = plane(free())
+    shares = [-1.0]
+
+    def proved(_: object) -> float:
+        if not shares:
+            raise OutOfTime
+        return shares.pop()
+
+    monkeypatch.setattr(near_one, "relative_below", proved)
+    assert near_one.rarely(inner, model, 8, 0.0, None, below=True) == -1.0
+    with pytest.raises(OutOfTime):
+        near_one.rarely(inner, model, 8, 0.0, None, below=True)
+    cells, found = list[int](), {False: -9.0, True: -9.5}
+
+    def bounded(plane: Plane, model: Model, count: int, level: float, points: object, *, below: bool) -> float:
+        cells.append(count)
+        if below not in found:
+            raise OutOfTime
+        return found[below]
+
+    def ask(guesses: list[float] | None, wanted: float = -10.0) -> tuple[float, float | None]:
+        cells.clear()
+        other = functools.partial(pytest.fail, "logarithms are not asked")
+        return near_one._with_rare(free(), model, (inner, inner), 20.0, -9.1, wanted, other, True, guesses)[:2]
+
+    monkeypatch.setattr(near_one, "rarely", bounded)
+    assert ask(None) == (-9.0, -9.5)
+    assert near_one._RARELY * sum(count**2 for count in cells) < 1.03 * 20.0
+    guesses: list[float] = []
+    assert ask(guesses) == (-9.0, None)
+    assert (guesses, len(cells)) == ([-9.1], 1)
+    del found[True]
+    assert ask(None) == (-9.0, None)
+    found.clear()
+    with pytest.raises(OutOfTime):
+        ask(None)

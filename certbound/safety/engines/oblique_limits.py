@@ -347,7 +347,7 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
                 other = logarithmic(problem)
         if other is None:
             return prove(problem, asked)
-        places, turned = other
+        (places, turned), ended, left = other, True, seconds_left()
         names = ", ".join(f"log {problem.system.states[i]}" for i in places)
 
         def stated(answer: EngineAnswer, plain: EngineAnswer = _UNASKED) -> EngineAnswer:
@@ -358,9 +358,9 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
                 reason=f"{answer.reason.rstrip('.')}; in the coordinates {names}.", details=details,
             )  # fmt: skip
 
-        inner = replace(asked, before=before and before.answer.details, found=lambda one: asked.found(stated(one)))
+        earlier, old = (before.answer.details, before.plain.details) if before else (None, asked.before)
+        inner = replace(asked, before=earlier, above=True, found=lambda one: asked.found(stated(one)))
         found: EngineAnswer | None = None
-        ended, left = True, seconds_left()
         with share_of_time(_HALF):
             with contextlib.suppress(InfeasibleError, EnclosureError):
                 found = prove(turned, inner)
@@ -374,11 +374,11 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
             asked.found(stated(found))
         if found is not None and again and not asked.thorough:
             return stated(found)
-        near = found is not None and useful and (found.log10_lower or -math.inf) > found.log10_delta - _NEAR
-        old = before.plain.details if before else asked.before
+        hoped = None if found is None else found.hoped if found.log10_lower is None else found.log10_lower
+        near = found is not None and useful and hoped is not None and hoped > found.log10_delta - _NEAR
         plain = _UNASKED if near else prove(problem, replace(asked, before=old))
         if found is not None and useful and not (plain.applicable and plain.log10_delta <= found.log10_delta):
-            return _raised(prove, problem, asked, stated(found, plain), found.log10_lower)
+            return _raised(prove, problem, asked, stated(found, plain), hoped)
         return plain
 
     return proved

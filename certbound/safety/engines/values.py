@@ -175,7 +175,8 @@ def _confined(problem: Problem, limit: float) -> ExitBounds | None:
 def _exits(problem: Problem, limit: float, asked: Request) -> ExitBounds:
     target, spare = problem.reach, asked.bounded and not asked.thorough
     if target is None:
-        return bound_exits(problem, seconds=limit, delta=problem.delta, spare=spare, above=not asked.below)
+        return bound_exits(problem, seconds=limit, delta=problem.delta, spare=spare, above=not asked.below,
+                           below=not asked.above)  # fmt: skip
     first, last = target.during or (0.0, float(problem.horizon))
     if first > 0:
         raise InfeasibleError("value functions in continuous time need a target that counts from the beginning.")
@@ -187,6 +188,7 @@ def _continuous(found: ExitBounds) -> EngineAnswer:
     return EngineAnswer(
         log10_delta=found.upper,
         log10_lower=found.lower,
+        hoped=found.hoped,
         reason=found.words,
         method="values",
         details=found,

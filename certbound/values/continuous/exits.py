@@ -60,6 +60,8 @@ class ExitBounds:
         V of every upper bound that was better than those before, and what it was paid with.
     proposed_below : tuple of (Surface or Surfaces of stages, Payment)
         The same of the lower bounds.
+    hoped : float or None
+        A guess at the lower bound that was left out.
     """
 
     upper: float
@@ -68,11 +70,12 @@ class ExitBounds:
     seconds: float
     proposed: tuple[Proposed, ...] = ()
     proposed_below: tuple[Proposed, ...] = ()
+    hoped: float | None = None
 
 
 def bound_exits(
     problem: Problem, *, target: Any = None, seconds: float = 10.0, lower: bool = True, delta: float = 0.0,
-    spare: bool = False, above: bool = True,
+    spare: bool = False, above: bool = True, below: bool = True,
 ) -> ExitBounds:
     """Bound P(X_t leaves the safe set for some t <= T) from above and from below by Theorem K8-CT.
 
@@ -98,6 +101,8 @@ def bound_exits(
         In three states: stop where a rough guess says that this is out of reach.
     above : bool
         In two states: without it no upper bound is looked for where the lower one does not need it.
+    below : bool
+        The same of the lower bound.
 
     Returns
     -------
@@ -123,24 +128,25 @@ def bound_exits(
     _check(problem, target, seconds, most=3)
     model, ended = _model(problem), None
     proposed: Sequence[Proposed] = ()
-    below: Sequence[Proposed] = ()
+    earned: Sequence[Proposed] = ()
+    guesses: list[float] | None = None if below else []
     if target is not None and problem.system.dimension == 2:
         from certbound.values.continuous.curved import ramps_for
         from certbound.values.continuous.plane import bound_failing
 
         _refuse_random(problem)
         found = bound_failing(problem, model, target, begin + seconds, ramps_for)
-        upper, least, words, (proposed, below) = found
+        upper, least, words, (proposed, earned) = found
     elif target is not None:
         from certbound.values.continuous.line import bound_arrival
 
-        most, rest, words, (proposed, below) = bound_arrival(problem, model, target)
+        most, rest, words, (proposed, earned) = bound_arrival(problem, model, target)
         upper, least = most, None if rest == -math.inf else rest
     elif problem.system.dimension == 1:
         from certbound.values.continuous.line import bound_ended, bound_line
 
         ended = bound_ended(problem, model, seconds) if problem.ending else None
-        upper, least, words, (proposed, below) = ended or bound_line(problem, model, seconds, lower)
+        upper, least, words, (proposed, earned) = ended or bound_line(problem, model, seconds, lower)
     elif problem.system.dimension == 3:
         from certbound.values.continuous.space import three_states
 
@@ -153,27 +159,27 @@ def bound_exits(
         upper, least, words = bound_moving(problem, model, begin + seconds, wanted)
     elif windowed(problem):
         _refuse_random(problem)
-        upper, least, words, (proposed, below) = bound_windows(problem, model, begin + seconds)
+        upper, least, words, (proposed, earned) = bound_windows(problem, model, begin + seconds)
     elif walled(problem) and not (boxed(problem) and led(model)):
         from certbound.values.continuous.straight import bound_between
 
         _refuse_random(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
-        upper, least, words, (proposed, below) = bound_region(problem, model, begin + seconds, wanted, bound_between)
+        upper, least, words, (proposed, earned) = bound_region(problem, model, begin + seconds, wanted, bound_between)
     else:
         from certbound.values.continuous.straight import bound_plane
 
         _refuse_random(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
-        straight = partial(bound_plane, above=above)
+        straight = partial(bound_plane, above=above, guesses=guesses)
         way, room = (two_states, limits_of(problem)) if led(model) else (straight, safe_room(problem))
-        upper, least, words, (proposed, below) = way(problem, model, room, begin + seconds, wanted)
+        upper, least, words, (proposed, earned) = way(problem, model, room, begin + seconds, wanted)
     if problem.ending and ended is None:  # leaving the domain was counted as failing
-        least, below = None, ()
+        least, earned = None, ()
     return ExitBounds(
         upper=min(0.0, upper / _LN10 * (1 - 1e-15)), lower=None if least is None else least / _LN10 * (1 + 1e-15),
         words=words, seconds=time.perf_counter() - begin, proposed=tuple(proposed),
-        proposed_below=tuple(below),
+        proposed_below=tuple(earned), hoped=guesses[0] / _LN10 if guesses else None,
     )  # fmt: skip
 
 

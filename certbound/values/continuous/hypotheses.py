@@ -126,7 +126,7 @@ def examine(
         place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
         low, high = value_range(patches)
-        size = coarse_size(patches, drifts, squares, place)
+        size = np.inf if straight else coarse_size(patches, drifts, squares, place)  # takes as long as to look
         due = ~(low >= need.top) & ~(high <= need.bottom) & ~(size <= need.free(high))  # no number is looked at, too
         kept = np.flatnonzero(due & ~np.tile(over, ends[1] - ends[0]))
         if not len(kept):

@@ -31,6 +31,7 @@ from certbound.values.continuous.polynomials import basis_at, lebesgue, nodes_of
 SPACE, TIME = 5, 3
 CUBIC = 3  # in each of three states
 _ROUNDOFFS = 500 * UNIT
+_LEFT_OUT = 100 * UNIT
 _CHANGE = 600 * UNIT  # dot products of at most 17 terms along each axis, or of 17^2 where two axes are one product
 
 
@@ -113,7 +114,8 @@ def bound_ranges(
     extremes = _straight if straight else (_on_line, _in_plane, _in_space)[n - 1]
     least, most, floor, largest = extremes(patches, drifts, squares, place, counts, wanted, near, upper)
     error, sizes = _errors(patches, squares.size[:, place], n)
-    loss = _diffusive_loss(patches, squares.remainder[:, place], n)
+    remainders = squares.remainder[:, place]
+    loss = _coarsely(patches, remainders, sizes) if _exact(squares) else _diffusive_loss(patches, remainders, n)
     sampled = float(np.prod([lebesgue(count) for count in counts])) * _ROUNDOFFS
     changed = float(np.prod([norm(to_bernstein(count)) for count in counts])) * _CHANGE
     high, low = np.full(len(error), -np.inf), np.full(len(error), -np.inf)
@@ -121,7 +123,7 @@ def bound_ranges(
         own, slack = error, loss
         for i in range(n):
             own = own + drift.size[i, place] * sizes[i]
-            slack = slack + drift.remainder[i, place] * _steepest(patches, i)
+            slack = slack + drift.remainder[i, place] * (sizes[i] if _exact(drift) else _steepest(patches, i))
         slack = (sampled * own + changed * largest[branch] + slack) * (1 + 1e-9)
         high, low = np.maximum(high, most[branch] + slack), np.maximum(low, least[branch] - slack)
     floor = np.maximum(floor - (sampled * error + changed * largest[-1] + loss) * (1 + 1e-9), 0.0)
@@ -333,12 +335,22 @@ def _at_samples(coefficients: Array, counts: Sequence[int]) -> Array:
 def _errors(patches: Patches, squares: Array, n: int) -> tuple[Array, list[Array]]:
     """The size in which rounding errors of everything but f.grad V are counted, and the sizes of grad V."""
     sizes = [10 * patches.size / width for width in patches.widths]
-    total = 6 * patches.size / patches.step
+    return 6 * patches.size / patches.step + _coarsely(patches, squares, sizes), sizes
+
+
+def _coarsely(patches: Patches, squares: Array, sizes: list[Array]) -> Array:
+    """A bound of |tr(a V'')| / 2 + Q2 for a of these sizes, from Z alone."""
+    total, n = np.zeros(len(patches.size)), len(sizes)
     for i in range(n):
         for j in range(n):
             curved = 100 * patches.size / (patches.widths[i] * patches.widths[j]) + sizes[i] * sizes[j]
             total = total + 0.5 * squares[i * n + j] * curved
-    return total, sizes
+    return total
+
+
+def _exact(polynomials: Interpolant) -> bool:
+    """Whether what they leave out is a matter of rounding: coarse bounds of what it is multiplied with do then."""
+    return bool(polynomials.remainder.max() <= _LEFT_OUT * polynomials.size.max())
 
 
 def _steepest(patches: Patches, axis: int) -> Array:

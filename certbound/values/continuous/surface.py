@@ -247,6 +247,8 @@ class Surface:
 def _patches_of(data: Array, steps: Array, axes: tuple[Array, ...]) -> Patches:
     """Bernstein coefficients from Hermite data of shape (S, 4, N_1 + 1, d, ...): degree 2 d - 1 in each state."""
     n, slabs = len(axes), len(steps)
+    if n == 2 and data.shape[3] == 3:
+        return _patches_in_plane(data, steps, axes)
     orders = data.shape[3] if n else 3
     hermite = HERMITE if orders == 3 else CUBIC_HERMITE
     cells = tuple(len(axis) - 1 for axis in axes)
@@ -275,6 +277,19 @@ def _patches_of(data: Array, steps: Array, axes: tuple[Array, ...]) -> Patches:
         coefficients = along(hermite, coefficients, 2 + axis)
         magnitude = along(np.abs(hermite), magnitude, 2 + axis)
     size = magnitude.reshape(len(step), -1).max(axis=1)
+    return Patches(coefficients=coefficients, reference=reference, size=size, step=step, widths=widths)
+
+
+def _patches_in_plane(data: Array, steps: Array, axes: tuple[Array, ...]) -> Patches:
+    """The same in two states, compiled."""
+    from certbound.values.continuous.kernel import bernstein_in_plane
+
+    first, second = (np.diff(axis) for axis in axes)
+    widths = _cell_widths(axes, len(steps))
+    count = len(widths[0])
+    coefficients, reference, size = np.empty((count, 4, 6, 6)), np.empty(count), np.empty(count)
+    bernstein_in_plane(data, np.ascontiguousarray(steps), first, second, coefficients, reference, size)
+    step = np.repeat(steps, count // len(steps))
     return Patches(coefficients=coefficients, reference=reference, size=size, step=step, widths=widths)
 
 

@@ -172,3 +172,19 @@ def test_a_lower_bound_in_logarithms_is_proved_of_fewer_starts() -> None:
     assert (found.log10_delta, found.log10_lower) == (-0.5, -1.5)
     assert isinstance(found.details, Logarithmic)
     assert found.details.plain.log10_lower == -3.0  # what certificates state
+
+
+def test_a_lower_bound_that_is_hoped_for_in_logarithms_is_asked_for_once() -> None:
+    problem = stocks().replace(initial=cb.Box([0.9, 1.9], [1.1, 2.1]))
+    asked_for = []
+
+    def prove(given: cb.Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+        assert given is not problem  # what is hoped for is near enough
+        asked_for.append((asked.above, asked.below))
+        if asked.above:
+            return EngineAnswer(log10_delta=-0.5, hoped=-0.9, reason="so.", method="values")
+        return EngineAnswer(log10_lower=-0.8, reason="so.", method="values")
+
+    found = by_logarithms(prove)(problem, AS_IT_IS)
+    assert (found.log10_delta, found.log10_lower) == (-0.5, -0.8)
+    assert asked_for == [(True, False), (False, True)]

@@ -7,7 +7,6 @@ shrinks by its factor from one pass to the next. The last one is bounded on ever
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -32,7 +31,6 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
-from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
@@ -53,12 +51,13 @@ _MARGIN = {True: 0.45, False: 0.35}  # of a cell, times the correlation of noise
 _FACTORS = (1.12, 4.0, 4.0, 4.0, 4.0)
 _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0, 2.0)  # both where failing is rare
-_ABOVE, _BELOW = 0.82, 1.05  # of what may be spent, for each bound then
-_RARELY = 0.0065  # about the seconds of one of them, over cells^2
+_FIRST, _ABOVE, _BELOW = 0.5, 0.44, 0.56  # of what may be spent, for logarithms; of the rest, for each bound then
+_RARELY = 0.0035  # about the seconds of one of them, over cells^2
 _FAR = 1.0  # of log P above a rough guess: logarithms may do better
-_FINE = 30  # cells along each state, without which nothing comes of it
+_FINE = 34  # cells along each state, without which nothing comes of it
 _LONG = {True: 0.02, False: 0.012}  # a ramp's share of the horizon then: fronts start as wide as cells
-_NEARLY = 0.06  # of log P: what is left to pay is no more
+_NEARLY = 0.1  # of log P: what is left to pay is no more
+_SAMPLED = 0.2  # of U where failing is rare: with less to pay samples have told what they can
 _SPARED = 0.03  # of U, which need not be carried then
 _VAIN = 0.1  # of the cost, of a proposal that is not proved
 _LEFT = 0.01  # of the answer: a residual that need not be carried any more
@@ -70,9 +69,13 @@ _ENOUGH = 0.25  # and nothing else is tried
 
 
 def bound_plane(
-    problem: Problem, model: Model, room: Room, deadline: float, wanted: float, *, above: bool = True
+    problem: Problem, model: Model, room: Room, deadline: float, wanted: float, *, above: bool = True,
+    guesses: list[float] | None = None,
 ) -> Found:
-    """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare."""
+    """As `two_states`: the best of both ways, this one first where it applies and failing is not too rare.
+
+    ``guesses`` gets a rough one at log P where a lower bound takes a proof of its own, which is left out then.
+    """
     inner = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     outer = replace(inner, low=_pair(room.outer_low), high=_pair(room.outer_high))
     other = partial(two_states, problem, model, room)
@@ -81,21 +84,20 @@ def bound_plane(
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
     if wanted < math.inf:
         check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
-    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above)
+    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above, guesses=guesses)
 
 
 def bound_between(
     problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other,
-    *, looked: bool = True,
+    *, looked: bool = True, guesses: list[float] | None = None,
 ) -> Found:
     """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due."""
     granted = round(deadline - time.perf_counter(), 1)
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
     level = rough_level(inner)
     if not served or not _RARE < level < 0:
-        rare = served and _RAREST < level <= _RARE and round(math.sqrt(_ABOVE * granted / _RARELY)) >= _FINE
-        if rare:
-            return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked)
+        if served and _RAREST < level <= _RARE and granted >= _RARELY * _FINE**2:
+            return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked, guesses)
         return other(time.perf_counter() + granted, wanted)
     upper, lower, spent, done = 0.0, -math.inf, 0.0, list[str]()
     above, below, hopes = list[Proposed](), list[Proposed](), list[float]()
@@ -142,34 +144,43 @@ def bound_between(
 
 def _with_rare(
     problem: Problem, model: Model, boxes: tuple[Plane, Plane | None], granted: float, level: float, wanted: float,
-    other: Other, looked: bool,
+    other: Other, looked: bool, guesses: list[float] | None,
 ) -> Found:
     """Both bounds where failing is rare: by logarithms, which certificates state, where these may do for ``wanted``.
 
     Then shares of U are paid, first from above if that is ``looked`` for, and logarithms serve where that fails.
     """
-    inner, outer = boxes
-    cells = [round(math.sqrt(share * granted / _RARELY)) for share in (_ABOVE, _BELOW)]
+    inner, outer = boxes if guesses is None else (boxes[0], None)
     upper, least, words = 0.0, None, "value function in two states, cells: "
     proposed = list[Proposed](), list[Proposed]()
-    if looked and wanted >= level - _LIKELY:
-        upper, least, words, proposed = other(time.perf_counter() + granted, math.inf)
-        if upper <= wanted:
+    room = granted / (_RARELY * _FINE**2)
+    if looked and wanted >= level:
+        share = _FIRST if room * (1 - _FIRST) >= 1 else 1.0
+        upper, least, words, proposed = other(time.perf_counter() + share * granted, math.inf)
+        if upper <= wanted or share == 1:
             return upper, least, words, proposed
-        words += ", "
-    with contextlib.suppress(OutOfTime):
+        words, granted, room = f"{words}, ", (1 - share) * granted, (1 - share) * room
+    shares = (_ABOVE, _BELOW) if room * _ABOVE >= 1 else (1.0, 1.0)
+    cells = [round(math.sqrt(share * granted / _RARELY)) for share in shares]
+    outer = outer if shares[0] < 1 or not looked else None  # one bound or none
+    try:
         if looked:
             found = rarely(inner, model, cells[0], level, None, below=False)
             upper, words = min(upper, 0.0 if found is None else found), f"{words}{cells[0]}^2"
+        if upper > wanted and guesses is not None:
+            guesses.append(level)
         if upper > wanted and outer is not None and wanted < math.inf:
             least = rarely(outer, model, cells[1], level, points_of(problem), below=True)
             words += f", {cells[1]}^2 below"
-    done = not looked or upper <= wanted or upper < level + _FAR
-    if done and (least is not None or upper <= wanted or outer is None or wanted == math.inf):
-        return upper, least, words, proposed
-    logs = other(time.perf_counter() + granted, wanted)
-    least = max((one for one in (least, logs[1]) if one is not None), default=None)
-    return min(upper, logs[0]), least, f"{words} and {logs[2].rpartition('cells: ')[2]}", logs[3]
+        done = not looked or upper <= wanted or upper < level + _FAR
+        if not done or (least is None and upper > wanted and outer is not None and wanted < math.inf):
+            logs = other(time.perf_counter() + _FIRST * granted, wanted)
+            least = max((one for one in (least, logs[1]) if one is not None), default=None)
+            upper, words, proposed = min(upper, logs[0]), f"{words} and {logs[2].rpartition('cells: ')[2]}", logs[3]
+    except OutOfTime:
+        if upper == 0 and least is None:
+            raise
+    return upper, least, words, proposed
 
 
 def _pair(ends: tuple[float, ...]) -> tuple[float, float]:
@@ -215,17 +226,21 @@ def rarely(
     if chosen is None:
         return None
     value, solver, surface, source = chosen
-    for factor in (*_GENTLY[1], None):
-        spare, left = NEGLIGIBLE * solver.small * value, _SPARED / plane.horizon * _least(surface, solver.small)
-        given = surface, model, plane.starts, spare, solver.small * left
-        proof = seen_below(*given, points, plane.cut) if below else seen_above(*given)
-        share = relative_below(proof) if below else relative_above(proof)
-        best += [] if share is None else [share]
-        table = _needed(proof, surface, solver.small, below=below)
-        if factor is None or table is None or (best and abs(best[-1] - math.log(value)) < _NEARLY):
-            break
-        source = _more(source, surface, factor * np.maximum(table - left, 0.0))
-        surface = solver.surface(source, below=below)
+    try:
+        for factor in (*_GENTLY[1], None):
+            spare, left = NEGLIGIBLE * solver.small * value, _SPARED / plane.horizon * _least(surface, solver.small)
+            given = surface, model, plane.starts, spare, solver.small * left
+            proof = seen_below(*given, points, plane.cut) if below else seen_above(*given)
+            share = relative_below(proof) if below else relative_above(proof)
+            best += [] if share is None else [share]
+            table = _needed(proof, surface, solver.small, below=below)
+            if factor is None or table is None or (best and abs(best[-1] - math.log(value)) < _NEARLY):
+                break
+            source = _more(source, surface, factor * np.maximum(table - left, 0.0))
+            surface = solver.surface(source, below=below)
+    except OutOfTime:
+        if not best:
+            raise
     return (max if below else min)(best, default=None)
 
 
@@ -277,14 +292,14 @@ def _corrected(
         needed = np.where(asked, np.maximum(excess, 0.0), 0.0) / small
         paid = float(needed.max(axis=(1, 2)) @ surface.steps)
         if rare:  # as a share of U and what it is at the starts
-            share = needed / (_least(surface, small) + value)
-            paid = min(paid, 2 * value * float(share.max(axis=(1, 2)) @ surface.steps))
-            needed = np.maximum(needed - _SPARED / plane.horizon * _least(surface, small), 0.0)
+            own = _least(surface, small)
+            paid = min(paid, 2 * value * float((needed / (own + value)).max(axis=(1, 2)) @ surface.steps))
+            needed = np.maximum(needed - _SPARED / plane.horizon * own, 0.0)
         if not math.isfinite(paid) or value <= 0:
             break
         if best[0] is None or sign * (value - best[3]) + paid < 0:
             best = surface, source, value, value + sign * paid
-        if factor is None or paid < 2 * _LEFT * value or paid > _WORSE * least:
+        if factor is None or paid < (_SAMPLED if rare else 2 * _LEFT) * value or paid > _WORSE * least:
             break
         least = min(least, paid)
         source = _more(source, surface, factor * needed)
@@ -297,6 +312,8 @@ def _more(source: Source | None, surface: Surface, needed: Array) -> Source:
 
 
 def _least(surface: Surface, small: float) -> Array:
-    """The least U of each patch, 0 where it is less."""
-    low = [value_range(surface.patches(*chunk))[0] for chunk in surface.chunks()]
-    return np.maximum(1 + np.concatenate(low) / small, 0.0).reshape(surface.slabs, *surface.cells)
+    """About the least U of each patch, that at its corners; 0 where it is less."""
+    low = surface.values[:, :, 0, :, 0]
+    for axis in range(3):
+        low = np.minimum(np.delete(low, -1, axis), np.delete(low, 0, axis))
+    return np.maximum(1 + low / small, 0.0)

@@ -223,7 +223,7 @@ class Ramps:
             (root * self.mass - self.operator)[self.inner], eye(len(self.count), format="csr")[self.edge]
         ], format="csr")  # fmt: skip
         order = np.argsort(np.concatenate([self.inner, self.edge]))
-        solve: Solve = splu(csc_matrix(whole[order])).solve
+        solve: Solve = splu(csc_matrix(whole[order]), permc_spec="MMD_ATA").solve  # half the time of the usual order
         return solve
 
     def _written(self, times: Array, values: list[Array], rates: list[Array], below: bool) -> Surface:

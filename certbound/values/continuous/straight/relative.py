@@ -23,7 +23,17 @@ import numpy as np
 
 from certbound.arrays import Array, Index
 from certbound.rigor.intervals import Interval, exp, log
-from certbound.values.continuous.hypotheses import Model, Need, Proof, examine, extreme_over, raised_above, sunk, up
+from certbound.values.continuous.hypotheses import (
+    Model,
+    Need,
+    Proof,
+    examine,
+    extreme_over,
+    raised_above,
+    sunk,
+    top_of,
+    up,
+)  # fmt: skip
 from certbound.values.continuous.payment import Levels, Terms, bound_above, bound_below
 from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.surface import Surface
@@ -62,59 +72,56 @@ def relative_below(proof: Proof) -> float | None:
     """
     assert proof.seen is not None
     surface, need = proof.seen
-    excess, least = np.maximum(-proof.ranges.residual_low, 0.0), need.bottom
-    highest = max(0.0, *(float(value_range(surface.patches(*chunk))[1].max()) for chunk in surface.chunks()))
-    if not least < need.start < 0 or not np.isfinite(excess).all() or not highest < 1:
+    highest = max(0.0, top_of(surface))
+    if not highest < 1:
         return None
     more = math.exp(highest) * _UP  # than e^V anywhere
-    excess = excess * more
-    less = float(exp(Interval.point(least)).lo) - _SHIFT * (math.exp(need.start) - math.exp(least))
-
-    def grown(values: Array | float) -> Interval:
-        """W of V."""
-        return exp(Interval.point(np.asarray(values, dtype=float))) - Interval.point(less)
-
-    whole, begun, ended = log(Interval.point(1.0) - Interval.point(less)), grown(need.start), grown(least)
-    if ended.lo <= 0:
-        return None
-    lam, eps = _rates(excess, grown(np.maximum(proof.ranges.low, least)).lo, proof.slab, surface.slabs, float(begun.lo))
-    spare = need.spare * (1 + math.exp(need.start - least)) * more  # -R is at most that where nothing was looked at
-    terms = Terms(
-        levels=_NONE, lam=lam, eps=(eps + spare) / float(begun.lo) * _UP, steps=surface.steps,
-        start=float((log(begun) - whole).lo), end=float((log(ended) - whole).hi),
-    )  # fmt: skip
-    found = float(bound_below(terms, np.array(terms.start)))
+    excess, least = np.maximum(-proof.ranges.residual_low, 0.0) * more, need.bottom
+    terms = _terms(proof, excess, least, least, more, upper=False)
+    found = -math.inf if terms is None else float(bound_below(terms, np.array(terms.start)))
     return found if found > -math.inf else None
 
 
 def relative_above(proof: Proof) -> float | None:
     """An upper bound of log P from what `seen_above` saw of V; None where there is none.
 
-    k is below e^V everywhere, so that W > 0.
+    k is below e^V everywhere, so that W > 0; R bounds e^V R where V < 0.
+    """
+    assert proof.seen is not None
+    surface, _ = proof.seen
+    least = min(float(value_range(surface.patches(*chunk))[0].min()) for chunk in surface.chunks())
+    excess, end = np.maximum(proof.ranges.residual_high, 0.0), float(surface.range_at(-1)[0].min())
+    terms = _terms(proof, excess, least, end, 1.0, upper=True)
+    found = 0.0 if terms is None else float(bound_above(terms, np.array(terms.start)))
+    return found if found < 0 else None
+
+
+def _terms(proof: Proof, excess: Array, least: float, end: float, more: float, *, upper: bool) -> Terms | None:
+    """What is paid for log W / (1 - k), k a little below e^``least``: V is above that wherever something is asked.
+
+    ``end`` is V where paths end without having failed; where nothing was looked at, e^V R is within what `Need` grants
+    where V is ``least``, times ``more``.
     """
     assert proof.seen is not None
     surface, need = proof.seen
-    excess = np.maximum(proof.ranges.residual_high, 0.0)  # of e^V too where V < 0
-    least = min(float(value_range(surface.patches(*chunk))[0].min()) for chunk in surface.chunks())
-    if not least <= need.start < 0 or not np.isfinite(excess).all():
+    if not least < need.start < 0 or not np.isfinite(excess).all():
         return None
     less = float(exp(Interval.point(least)).lo) - _SHIFT * (math.exp(need.start) - math.exp(least))
 
     def grown(values: Array | float) -> Interval:
+        """W of V."""
         return exp(Interval.point(np.asarray(values, dtype=float))) - Interval.point(less)
 
-    whole, begun, ended = log(Interval.point(1.0) - Interval.point(less)), grown(need.start), grown(least)
-    if ended.lo <= 0:
+    whole, begun, ended = log(Interval.point(1.0) - Interval.point(less)), grown(need.start), grown(end)
+    if not min(grown(least).lo, ended.lo) > 0:
         return None
     lam, eps = _rates(excess, grown(np.maximum(proof.ranges.low, least)).lo, proof.slab, surface.slabs, float(begun.lo))
-    spare = need.spare * (1 + math.exp(need.start - least)) * _UP  # e^V R is at most that where nothing was looked at
-    ended = grown(float(surface.range_at(-1)[0].min()))
-    terms = Terms(
+    spare = need.spare * (1 + math.exp(need.start - least)) * more * _UP
+    start, stop = log(begun) - whole, log(ended) - whole
+    return Terms(
         levels=_NONE, lam=lam, eps=(eps + spare) / float(begun.lo) * _UP, steps=surface.steps,
-        start=float((log(begun) - whole).hi), end=float((log(ended) - whole).lo),
+        start=float(start.hi if upper else start.lo), end=float(stop.lo if upper else stop.hi),
     )  # fmt: skip
-    found = float(bound_above(terms, np.array(terms.start)))
-    return found if found < 0 else None
 
 
 def _rates(excess: Array, low: Array, slab: Index, slabs: int, begun: float) -> tuple[Array, Array]:
