@@ -72,9 +72,9 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
         payment[band.first : band.last] = paid
     bend = np.where(np.isfinite(bend), bend, 0.0)
     payment = payment + bounds.paid
-    owed = [catch.owed(value.nodal, value.bend, np.diff(frame.q)) for catch in bounds.catches]
-    if owed:
-        payment = payment - np.maximum.reduce(owed)
+    for catch in bounds.catches:
+        less, lacks = catch.owed(value.nodal, value.bend, np.diff(frame.q))
+        nodal, payment = nodal - less, payment + lacks
     return limited(frame, bounds, nodal + bounds.nodal + around_nodes(payment, largest=True), bend)
 
 

@@ -11,7 +11,7 @@ bilinear in between, and a cell pays besides what that lacks on one of its parts
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,23 +25,27 @@ from certbound.values.semilagrangian.local_steps import Blocks, Clock
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.obstacles.catches import caught
 from certbound.values.semilagrangian.obstacles.passings import Passing, passed, passing
+from certbound.values.semilagrangian.remainders import remainders
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Way:
     """Past one end along q of an obstacle, whose ``ends`` in p these are.
 
-    ``paid`` says from which blocks, shape (blocks of y, blocks of q), and ``place`` where these are in ``found``.
+    ``paid`` says from which blocks, shape (blocks of y, blocks of q), and ``place`` where these are in ``found``, and in
+    ``close``: the same on narrower tubes.
     """
 
     ends: Ends
     found: Passing
+    close: Passing
     place: Index
     paid: Mask
 
 
 _PARTS = (2, 4)  # of a cell, along y and q, from which tolls are asked
 _SIDES = ((0, 0), (0, 1), (1, 0), (1, 1))
+_CLOSE = 4.2  # omega of narrower tubes, whose rareness is paid where they are used
 _ABOVE = np.array([0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
 
 
@@ -49,48 +53,53 @@ _ABOVE = np.array([0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
 class Catch:
     """Who is caught within a step and ends beside an obstacle, at one of its ends along q.
 
-    ``chance`` has lower bounds for K heights, shape (K, ny - 1, nq - 1), and ``places`` the cells in which who ends
-    above them may be.
+    ``nodal``, shape (K, ny, nq), bilinear in between, less ``lacks``, shape (K, ny - 1, nq - 1), on cells, are lower bounds
+    for K heights, and ``places`` the cells in which who ends above them may be.
     """
 
-    chance: Array
+    nodal: Array
+    lacks: Array
     places: Mask
 
-    def owed(self, nodal: Array, bend: Array, dq: Array) -> Array:
-        """What -L may be lowered by, shape (ny - 1, nq - 1); ``nodal`` and ``bend`` are those of -L."""
+    def owed(self, nodal: Array, bend: Array, dq: Array) -> tuple[Array, Array]:
+        """What -L may be lowered by at nodes, and raised by on cells; ``nodal`` and ``bend`` are those of -L."""
         most = -over_corners(np.minimum, nodal)
         most += np.maximum(-np.minimum(bend[1:], bend[:-1]), 0.0) * dq**2 / 8 * (1 + 1e-9) + 1e-12
-        total, before = np.zeros(most.shape), 1.0
-        for chance, places in zip(self.chance, self.places):
+        shares, before = [], 1.0
+        for places in self.places:
             now = min(before, max(float(np.max(most[places], initial=0.0)), 0.0))
-            total += (before - now) * chance
+            shares.append(before - now)
             before = now
-        return total * (1 - 1e-9)
+        return (
+            np.tensordot(np.array(shares) * (1 - 1e-9), self.nodal, axes=1), np.tensordot(shares, self.lacks, axes=1)
+        )  # fmt: skip
 
 
 def catches_of(
     setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
 ) -> list[Catch]:
-    """What cells are paid from below, obstacle by obstacle and end by end; as `tolls_of`."""
+    """What cells are paid from below, end by end of the first obstacle with any; as `tolls_of`."""
     s, (p_tube, q_tube) = setting.noise * (1 + setting.spread), blocks.strays.tube
     above, faces, catches = _ABOVE * setting.noise * math.sqrt(clock.step), setting.faces[1], []
     y, q = Interval(frame.y[:-1], frame.y[1:]), Interval(frame.q[:-1], frame.q[1:])
     for way in (way for ways in every for way in ways):
         kept = way.paid & (q_tube.lo > faces[0]) & (q_tube.hi < faces[1])
-        kept[kept] = way.found.stays[way.place[kept]]
+        kept[kept] = way.close.stays[way.place[kept]]
         if not kept.any():
             continue
-        chance = np.zeros((len(above), *frame.live.shape))
+        less = np.zeros((*_PARTS, len(above), *frame.live.shape))
         for i, j in np.argwhere(kept):
             rows, columns = _cells(frame, starts, i, j)
             if not len(rows):
                 continue
-            p, here, rates = _starts_in(setting, clock, frame, rows, columns)
+            p, here, rates = _on_parts(setting, clock, frame, rows, columns)
             far = np.nextafter(p.hi - way.ends[1], np.inf), np.nextafter(way.ends[0] - p.lo, np.inf)
-            chance[:, rows, columns] = caught(
-                way.found, int(way.place[i, j]), (here - way.found.end) * way.found.sign,
-                _drift(setting, way.found, p), far, rates, above, s, clock.step, clock.omega,
+            chance = caught(
+                way.close, int(way.place[i, j]), (here - way.found.end) * way.found.sign,
+                _drift(setting, way.found, p), far, rates, above, s, clock.step,
             )  # fmt: skip
+            chance = np.moveaxis(chance.reshape(len(above), *_PARTS, len(rows)), 0, 2)
+            less[..., rows, columns] = -chance
         tall = float(q_tube.lo[kept].min()), float(q_tube.hi[kept].max())
         ends = max(float(p_tube.lo[kept].min()), way.ends[0]), min(float(p_tube.hi[kept].max()), way.ends[1])
         slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
@@ -99,7 +108,8 @@ def catches_of(
         p = y[:, None] + (q * clock.shear)[None]
         high = ((q - way.found.end) * way.found.sign).hi
         near = (p.hi >= ends[0]) & (p.lo <= ends[1]) & (q.hi >= tall[0]) & (q.lo <= tall[1])
-        catches.append(Catch(chance=chance, places=near & (high >= above[:, None])[:, None]))
+        nodal, lacks = (np.stack(part) for part in zip(*(_shared(less[:, :, k]) for k in range(len(above)))))
+        catches.append(Catch(nodal=-nodal, lacks=lacks, places=near & (high >= above[:, None])[:, None]))
     return catches
 
 
@@ -109,15 +119,17 @@ def _cells(frame: Frame, starts: tuple[Index, Index], i: int, j: int) -> tuple[I
     return rows + starts[0][i], columns + starts[1][j]
 
 
-def _starts_in(
-    setting: Setting, clock: Clock, frame: Frame, rows: Index, columns: Index, part: tuple[int, ...] | None = None
+def _on_parts(
+    setting: Setting, clock: Clock, frame: Frame, rows: Index, columns: Index
 ) -> tuple[Interval, Interval, Interval]:
-    """p, q and F on cells, or on one of their parts."""
+    """p, q and F on all parts of cells, part by part."""
     y, q = Interval(frame.y[rows], frame.y[rows + 1]), Interval(frame.q[columns], frame.q[columns + 1])
-    if part is not None:
-        y, q = (_part(ends, place, count) for ends, place, count in zip((y, q), part, _PARTS))
+    y, q = (
+        concatenate([_part(ends, part[axis], _PARTS[axis]) for part in np.ndindex(*_PARTS)])
+        for axis, ends in enumerate((y, q))
+    )
     p = y + q * clock.shear
-    f, bad, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(rows))), p, q])
+    f, bad, _ = evaluate(setting.tape, [Interval.point(np.zeros(len(p))), p, q])
     return p, q, Interval(np.where(bad, -np.inf, f.lo[:, 0]), np.where(bad, np.inf, f.hi[:, 0]))
 
 
@@ -145,15 +157,19 @@ def ways_past(
     if ends is None or not len(hit[0]):
         return []
     y, q = (Interval(edge[part], edge[part + 1]) for edge, part in zip(edges, hit))
-    found = []
+    start, found = y + q * clock.shear, []
+    s = setting.noise * (1 + setting.spread)
+    narrow = remainders(setting.tape, s, start, q, step=clock.step, omega=_CLOSE)
     for side in (0, 1):
         if math.isfinite(ends[1][side]):
-            here = passing(
-                ends, setting.tape, (tube[0][hit], tube[1][hit]), y + q * clock.shear, blocks.strays.bow[hit] > 0, side
+            here, close = (
+                passing(ends, setting.tape, part, start, blocks.strays.bow[hit] > 0, side, omega)
+                for part, omega in (((tube[0][hit], tube[1][hit]), clock.omega), (narrow.tube, _CLOSE))
             )
+            close = replace(close, known=close.known & narrow.known, stays=close.stays & narrow.known)
             place, paid = np.zeros(usable.shape, dtype=int), np.zeros(usable.shape, dtype=bool)
             place[hit], paid[hit] = np.arange(len(hit[0])), here.known
-            found.append(Way(ends=ends[0], found=here, place=place, paid=paid))
+            found.append(Way(ends=ends[0], found=here, close=close, place=place, paid=paid))
     return found
 
 
@@ -176,8 +192,7 @@ def tolls_of(
                 continue
             most = np.tile(float(blocks.strays.most[1][i, j]) + bent[rows, columns], math.prod(_PARTS))
             every_part = list(np.ndindex(*_PARTS))
-            each = [_starts_in(setting, clock, frame, rows, columns, part) for part in every_part]
-            p, q, rates = (concatenate(list(values)) for values in zip(*each))
+            p, q, rates = _on_parts(setting, clock, frame, rows, columns)
             corners = np.stack([
                 np.concatenate([_between(frame.image[1], rows, columns, part, side) for part in every_part])
                 for side in _SIDES
@@ -187,13 +202,15 @@ def tolls_of(
             ends = ways[0].ends
             away = np.nextafter(p.lo - ends[1], -np.inf), np.nextafter(ends[0] - p.hi, -np.inf)
             for way in ways:
-                if way.paid[i, j]:
-                    sign, end = way.found.sign, way.found.end
-                    due = np.minimum(due, passed(
-                        way.found, int(way.place[i, j]), ((q - end) * sign).lo,
-                        _drift(setting, way.found, p).lo, away, rates, (image - end) * sign,
-                        blocks.covariance[2][i, j], s, clock.step,
-                    ))  # fmt: skip
+                if not way.paid[i, j]:
+                    continue
+                sign, end, k = way.found.sign, way.found.end, int(way.place[i, j])
+                for found in (way.found, way.close):
+                    if found.known[k]:
+                        due = np.minimum(due, passed(
+                            found, k, (q - end) * sign, _drift(setting, found, p), away, rates, (image - end) * sign,
+                            blocks.covariance[2][i, j], s, clock.step,
+                        ))  # fmt: skip
             total[:, :, rows, columns] += due.reshape(*_PARTS, len(rows))
     return _shared(total)
 
@@ -207,13 +224,13 @@ def _between(table: Array, rows: Index, columns: Index, part: tuple[int, ...], s
 
 def _shared(due: Array) -> tuple[Array, Array]:
     """Payments at nodes, the most of the parts of cells there, and what cells lack with them; ``due`` by parts."""
-    nodal = np.zeros((due.shape[2] + 1, due.shape[3] + 1))
+    nodal = np.full((due.shape[2] + 1, due.shape[3] + 1), -np.inf)
     for a, b in _SIDES:
         place = slice(a, due.shape[2] + a), slice(b, due.shape[3] + b)
         nodal[place] = np.maximum(nodal[place], due[-a, -b])
     lacks = np.zeros(due.shape[2:])
-    rows, columns = np.nonzero(due.max(axis=(0, 1)) > 0)
+    rows, columns = np.nonzero(due.any(axis=(0, 1)))
     for part in np.ndindex(*_PARTS):
         least = np.min([_between(nodal, rows, columns, part, side) for side in _SIDES], axis=0)
-        lacks[rows, columns] = np.maximum(lacks[rows, columns], due[(*part, rows, columns)] - least * (1 - 1e-12))
+        lacks[rows, columns] = np.maximum(lacks[rows, columns], due[(*part, rows, columns)] - least + 1e-12 * np.abs(least))
     return nodal, lacks
