@@ -13,7 +13,7 @@ from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, through
 from certbound.values.semilagrangian.confines import TWICE
 from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import Setting
-from certbound.values.semilagrangian.obstacles import Catch
+from certbound.values.semilagrangian.obstacles import Catch, Toll
 from certbound.values.semilagrangian.smoothing import Lines
 
 
@@ -38,8 +38,8 @@ class Bounds:
         Whether this is about -L.
     paid : ndarray, shape (ny - 1, nq - 1), or 0
         What every cell pays besides in a step.
-    nodal : ndarray, shape (ny, nq), or 0
-        What is paid besides at nodes, and bilinear in between.
+    tolls : sequence of Toll
+        What is paid for obstacles.
     catches : sequence of Catch
         What cells are paid (-L).
     """
@@ -51,7 +51,7 @@ class Bounds:
     mirrors: Sequence[Mirror] = ()
     below: bool = False
     paid: Array | float = 0.0
-    nodal: Array | float = 0.0
+    tolls: Sequence[Toll] = ()
     catches: Sequence[Catch] = ()
 
 
@@ -72,10 +72,14 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
         payment[band.first : band.last] = paid
     bend = np.where(np.isfinite(bend), bend, 0.0)
     payment = payment + bounds.paid
+    dq = np.diff(frame.q)
     for catch in bounds.catches:
-        less, lacks = catch.owed(value.nodal, value.bend, np.diff(frame.q))
+        less, lacks = catch.owed(value.nodal, value.bend, dq)
         nodal, payment = nodal - less, payment + lacks
-    return limited(frame, bounds, nodal + bounds.nodal + around_nodes(payment, largest=True), bend)
+    for toll in bounds.tolls:
+        more, lacks = toll.due(value.nodal, value.bend, dq)
+        nodal, payment = nodal + more, payment + lacks
+    return limited(frame, bounds, nodal + around_nodes(payment, largest=True), bend)
 
 
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:

@@ -143,9 +143,11 @@ def passing(
 
 def passed(
     found: Passing, k: int, heights: Interval, drift: Interval, away: tuple[Array, Array], rates: Interval,
-    ends: Interval, variance: Interval, s: float, step: float,
+    ends: Interval, variance: Interval, above: Array, s: float, step: float,
 ) -> Array:  # fmt: skip
     """Upper bounds of the probability that a path meets the obstacle within the step and ends outside of it.
+
+    The first of all, then not with 0 < Z <= ``above``; shape (1 + K, N).
 
     Parameters
     ----------
@@ -162,6 +164,7 @@ def passed(
         Z of the noise-free flow's ends, with the remainder.
     variance : Interval
         Of Z at the step's end.
+    above : ndarray, shape (K,)
     s, step : float
     """
     motion = motion_of(found, k, heights, drift, s, step)
@@ -170,12 +173,17 @@ def passed(
         within, beyond = -ends.hi, -(found.depth + ends.lo)
         within = at_most(within / np.sqrt(np.where(within < 0, variance.lo, variance.hi))) * (1 - 4e-9)
         beyond = at_most(beyond / np.sqrt(np.where(beyond > 0, variance.lo, variance.hi)))
-    best: Array = np.ones(len(rates))
+    best, chosen = np.full(len(rates), np.inf), None
     for wide in _WIDE if np.isfinite([turn[k] for turn in found.turns]).any() else _WIDE[-1:]:
         arrival = arrival_of(found, k, away, rates, s, step, wide, upper=True)
         met, late = dipped(motion, arrival, np.array([-math.inf]), upper=True)[0], arrival.t >= step
-        best = np.minimum(best, np.where(late, met, np.maximum(met - within, 0.0) + beyond))
-    return best + 4 * float(at_most(np.array(-found.omega)))
+        met = np.where(late, met, np.maximum(met - within, 0.0) + beyond)
+        chosen = arrival if chosen is None else chosen.where(best <= met, arrival)
+        best = np.minimum(best, met)
+    higher = np.broadcast_to(best, (len(above), len(best)))
+    if found.stays[k] and chosen is not None:
+        higher = np.minimum(best, dipped(motion, chosen, above, upper=True) + beyond)
+    return np.minimum(np.vstack([best, higher]) + 4 * float(at_most(np.array(-found.omega))), 1.0)
 
 
 def motion_of(found: Passing, k: int, heights: Interval, drift: Interval, s: float, step: float) -> Motion:

@@ -24,11 +24,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from certbound.arrays import Array
+from certbound.arrays import Array, Mask
 from certbound.lazy import compiled
 from certbound.rigor.intervals import Interval
 
-_PIECES = 40
+_PIECES, _FEW, _RARELY = 32, 8, 1e-5  # pieces, and how many where hardly any path is
 _FAR = 6.0
 _SURE = 1e-10  # relative, for every erfc and product
 
@@ -56,6 +56,11 @@ class Arrival:
     gap: Array
     lean: Array
     loose: Array
+
+    def where(self, kept: Mask, other: Arrival) -> Arrival:
+        """This one where it is kept, else another."""
+        names = ("t", "gap", "lean", "loose")
+        return Arrival(**{name: np.where(kept, getattr(self, name), getattr(other, name)) for name in names})
 
 
 def dipped(motion: Motion, arrival: Arrival, above: Array, *, upper: bool) -> Array:
@@ -135,9 +140,10 @@ def _joint(a: float, m: float, tau: float, last: float, x: float, absent: tuple[
     gap, lean, loose = absent
     before, place, late = _below(low), low, 0.0 if upper else _below((gap + lean * low) / loose)
     total = before * _below(-_FAR) if upper else 0.0
-    for i in range(1, _PIECES + 2):
+    pieces = _PIECES if _below(end) > _RARELY else _FEW
+    for i in range(1, pieces + 2):
         last_place, last_late = place, late
-        place = low + (top - low) * i / _PIECES if i < _PIECES else (top if i == _PIECES else end)
+        place = low + (top - low) * i / pieces if i < pieces else (top if i == pieces else end)
         mass = _below(place)
         if upper:
             chance = _below((place - middle) / wide + 1e-12)
@@ -156,8 +162,9 @@ def _early(low: float, gap: float, lean: float, loose: float) -> float:
     top = max(low, 0.0) + 9.0
     before, chance = _below(-low), _below(-(gap + lean * low) / loose)
     total = _below(-top)
-    for i in range(1, _PIECES + 1):
-        place = low + (top - low) * i / _PIECES
+    pieces = 2 * _FEW
+    for i in range(1, pieces + 1):
+        place = low + (top - low) * i / pieces
         now, mass = _below(-(gap + lean * place) / loose), _below(-place)
         total += max(before * (1 + _SURE) - mass * (1 - _SURE), 0.0) * max(chance, now) * (1 + 1e-8)
         before, chance = mass, now
@@ -177,6 +184,10 @@ def _hits(
         gap, lean, loose = absent[0, n], absent[1, n], absent[2, n]
         turned = gap - 2 * lean * m * math.sqrt(tau), -lean, loose
         more = _early(-(a + m * tau) / math.sqrt(tau), gap, lean, loose) if upper and tau > 0.0 and gap < 1e300 else 0.0
+        if not upper and _below(-(a + m * tau) / max(math.sqrt(tau), 1e-300)) < _RARELY and a > 0.0:
+            if math.exp(min(power, 0.0)) * _below((a - m * tau) / max(math.sqrt(tau), 1e-300)) < _RARELY:
+                found[:, n] = 0.0  # too little to count
+                continue
         for k in range(len(beyond)):
             x = max(beyond[k, n], 0.0)
             total = more + _joint(a, m, tau, last, x, (gap, lean, loose), upper)

@@ -18,7 +18,7 @@ import numpy as np
 from certbound.arrays import Array, Index, Mask
 from certbound.rigor.intervals import Interval, concatenate
 from certbound.values.discrete import evaluate
-from certbound.values.grids import over_corners
+from certbound.values.grids import corners, over_corners
 from certbound.values.semilagrangian.bands import Frame
 from certbound.values.semilagrangian.confines import Ends, Wall
 from certbound.values.semilagrangian.local_steps import Blocks, Clock
@@ -46,7 +46,45 @@ class Way:
 _PARTS = (2, 4)  # of a cell, along y and q, from which tolls are asked
 _SIDES = ((0, 0), (0, 1), (1, 0), (1, 1))
 _CLOSE = 4.2  # omega of narrower tubes, whose rareness is paid where they are used
-_ABOVE = np.array([0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
+_ABOVE = np.array([0.03, 0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
+_UP_TO = np.array([0.06, 0.15, 0.3, 0.6])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Toll:
+    """What is paid for paths that meet an obstacle within a step and end beside it.
+
+    ``nodal``, shape (1 + K, ny, nq), bilinear in between, and ``lacks``, shape (1 + K, ny - 1, nq - 1), on cells: who does,
+    and who ends more than K heights beyond its end. ``rows``, shape (2, blocks): on which cells of y those come down, and
+    ``columns``, shape (2, K, nq - 1), on which of q, by end; ``side`` which end, shape (blocks), and ``spread`` the blocks of
+    cells of y and q.
+    """
+
+    nodal: Array
+    lacks: Array
+    rows: Index
+    side: Index
+    columns: Mask
+    spread: tuple[Index, Index]
+
+    def due(self, nodal: Array, bend: Array, dq: Array) -> tuple[Array, Array]:
+        """What is paid at nodes and on cells; ``nodal`` and ``bend`` are those of U."""
+        least = over_corners(np.minimum, nodal)
+        least -= np.maximum(-np.minimum(bend[1:], bend[:-1]), 0.0) * dq**2 / 8 * (1 + 1e-9) + 1e-12
+        shares = np.zeros((2 + self.columns.shape[1], *self.side.shape))
+        shares[0] = 1.0
+        for side in (0, 1):
+            here = self.side == side
+            for k, columns in enumerate(self.columns[side]):
+                if here.any() and columns.any():
+                    lowest = np.append(least[:, columns].min(axis=1), np.inf)
+                    found = np.minimum.reduceat(lowest, self.rows[:, here].T.ravel())[::2]
+                    shares[1 + k, here] = np.minimum(np.clip(found, 0.0, 1.0), shares[k, here])
+        shares = ((shares[:-1] - shares[1:]) * (1 + 1e-9))[:, self.spread[0][:, None], self.spread[1]]
+        paid = np.zeros(nodal.shape)
+        for one, part in zip(corners(paid), zip(*(corners(table) for table in self.nodal))):
+            np.maximum(one, (shares * np.stack(part)).sum(axis=0), out=one)
+        return paid, (shares * self.lacks).sum(axis=0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -175,44 +213,71 @@ def ways_past(
 
 def tolls_of(
     setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
-) -> tuple[Array, Array]:
-    """What nodes pay (bilinear in between), shape (ny, nq), and cells besides, shape (ny - 1, nq - 1).
-
-    ``starts``: the blocks' first cells, and the number of cells.
-    """
-    total = np.zeros((*_PARTS, *frame.live.shape))
-    s = setting.noise * (1 + setting.spread)
+) -> list[Toll]:
+    """What is paid for obstacles; ``starts``: the blocks' first cells, and the number of cells."""
+    s, found = setting.noise * (1 + setting.spread), []
     bent = frame.bends[1] * np.diff(frame.y)[:, None] ** 2 + frame.bends[3] * np.diff(frame.q) ** 2
     bent = bent / 8 * (1 + 1e-9) + 1e-14
     bent = bent + over_corners(np.maximum, frame.radius[1]) + 1e-13 * over_corners(np.maximum, np.abs(frame.image[1]))
-    for ways in every:
-        for i, j in np.argwhere(np.any([way.paid for way in ways], axis=0)) if ways else ():
+    above = _UP_TO * setting.noise * math.sqrt(clock.step)
+    spread = tuple(np.repeat(np.arange(len(part) - 1), np.diff(part)) for part in starts)
+    for ways in (ways for ways in every if ways):
+        total = np.zeros((1 + len(above), *_PARTS, *frame.live.shape))
+        chosen, side = np.zeros((2, *ways[0].paid.shape), dtype=int), np.zeros(ways[0].paid.shape, dtype=int)
+        for i, j in np.argwhere(np.any([way.paid for way in ways], axis=0)):
             rows, columns = _cells(frame, starts, i, j)
             if not len(rows):
                 continue
             most = np.tile(float(blocks.strays.most[1][i, j]) + bent[rows, columns], math.prod(_PARTS))
-            every_part = list(np.ndindex(*_PARTS))
             p, q, rates = _on_parts(setting, clock, frame, rows, columns)
-            corners = np.stack([
-                np.concatenate([_between(frame.image[1], rows, columns, part, side) for part in every_part])
+            corners_of = np.stack([
+                np.concatenate([_between(frame.image[1], rows, columns, part, side) for part in np.ndindex(*_PARTS)])
                 for side in _SIDES
             ])  # fmt: skip
-            image = Interval(corners.min(axis=0) - most, corners.max(axis=0) + most)
-            due = np.ones(len(p))
+            image = Interval(corners_of.min(axis=0) - most, corners_of.max(axis=0) + most)
             ends = ways[0].ends
             away = np.nextafter(p.lo - ends[1], -np.inf), np.nextafter(ends[0] - p.hi, -np.inf)
+            options = []
             for way in ways:
                 if not way.paid[i, j]:
                     continue
                 sign, end, k = way.found.sign, way.found.end, int(way.place[i, j])
-                for found in (way.found, way.close):
-                    if found.known[k]:
+                due = np.ones((1 + len(above), len(p)))
+                for one in (way.found, way.close):
+                    if one.known[k]:
                         due = np.minimum(due, passed(
-                            found, k, (q - end) * sign, _drift(setting, found, p), away, rates, (image - end) * sign,
-                            blocks.covariance[2][i, j], s, clock.step,
+                            one, k, (q - end) * sign, _drift(setting, one, p), away, rates, (image - end) * sign,
+                            blocks.covariance[2][i, j], above, s, clock.step,
                         ))  # fmt: skip
-            total[:, :, rows, columns] += due.reshape(*_PARTS, len(rows))
-    return _shared(total)
+                options.append((float(due.sum()), int(sign > 0), due))
+            side[i, j], due = min(options)[1:]
+            total[..., rows, columns] = due.reshape(-1, *_PARTS, len(rows))
+        nodal, lacks = (np.stack(part) for part in zip(*(_shared(part) for part in total)))
+        found.append(Toll(
+            nodal=nodal, lacks=lacks, rows=_landing(clock, frame, blocks, ways, above), side=side, spread=spread,
+            columns=_beside(frame, ways, above),
+        ))  # fmt: skip
+    return found
+
+
+def _landing(clock: Clock, frame: Frame, blocks: Blocks, ways: list[Way], above: Array) -> Index:
+    """First and last (excluded) cells of y in which who has met an obstacle may end beside it, shape (2, blocks)."""
+    p, ends = blocks.strays.tube[0], ways[0].ends
+    tall = [way.found.end + way.found.sign * part for way in ways for part in (0.0, float(above[-1]))]
+    slant = sorted(clock.shear * q for q in tall)
+    low, high = np.maximum(p.lo, ends[0]) - slant[-1] - 1e-9, np.minimum(p.hi, ends[1]) - slant[0] + 1e-9
+    first = np.clip(np.searchsorted(frame.y, low, side="right") - 1, 0, len(frame.y) - 2)
+    return np.stack([first, np.clip(np.searchsorted(frame.y, high), first + 1, len(frame.y) - 1)])
+
+
+def _beside(frame: Frame, ways: list[Way], above: Array) -> Mask:
+    """Cells of q up to the heights beyond the lower and the upper end of an obstacle, shape (2, K, nq - 1)."""
+    found = np.zeros((2, len(above), len(frame.q) - 1), dtype=bool)
+    for way in ways:
+        low, high = (np.minimum, np.maximum)
+        ends = [(part - way.found.end) * way.found.sign for part in (frame.q[:-1], frame.q[1:])]
+        found[int(way.found.sign > 0)] = (low(*ends) <= above[:, None]) & (high(*ends) > 0)
+    return found
 
 
 def _between(table: Array, rows: Index, columns: Index, part: tuple[int, ...], side: tuple[int, int]) -> Array:
