@@ -56,7 +56,7 @@ def caught(
     if not found.stays[k]:
         return best
     lost = 4 * float(at_most(np.array(-found.omega)))
-    motion = motion_of(found, k, heights, drift, s, step)
+    motion = motion_of(found, k, heights, drift, rates, s, step)
     for wide in _WIDE:
         arrival = arrival_of(found, k, far, rates, s, step, wide, upper=False)
         best = np.maximum(best, np.nan_to_num(dipped(motion, arrival, above, upper=False) - lost))

@@ -42,7 +42,8 @@ from certbound.values.semilagrangian.confines import Ends
 from certbound.values.semilagrangian.obstacles.reflections import Arrival, Motion, dipped, grown
 
 _UP = 1 + 1e-9
-_WIDE = (1.0, 1.8, 2.6, 3.8, math.inf)
+_WIDE = (1.0, 1.7, 2.6, 3.8, math.inf)
+_FIRST = 2  # from which of them on wide tubes are asked, with which nothing is paid
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -57,8 +58,9 @@ class Passing:
         sup |W| is at most that times the root of the step on the tubes.
     pull, rest : ndarray
         Z' is the drift at the end less pull Z, but for so much.
-    turn : Interval
-        How fast the drift of q at the end changes, along Z.
+    turn, along, bend : Interval
+        How fast the drift of q at the end changes, along Z, and that by p; the drift of F, where F_q is constant and F has
+        one sign.
     speeds : (ndarray, ndarray)
         How fast p falls and rises at most.
     turns : (ndarray, ndarray)
@@ -78,6 +80,8 @@ class Passing:
     pull: Array
     rest: Array
     turn: Interval
+    along: Interval
+    bend: Interval
     speeds: tuple[Array, Array]
     turns: tuple[Array, Array]
     slow: tuple[Array, Array]
@@ -124,11 +128,15 @@ def passing(
     known = ~bad & ~worse & ~worst & ~jumps & np.isfinite(np.hstack([f.mag, at.mag, slopes.mag])).all(axis=1)
     reach = np.maximum(np.abs(q.lo - end), np.abs(q.hi - end))
     rest = slopes[:, 3].rad * reach * _UP
-    turn = slopes[:, 2] * f[:, 0] * sign
+    single = even & known & (falls | rises)
+    along = slopes[:, 2] * sign
+    turn = along * f[:, 0]
     return Passing(
         sign=sign, end=end, depth=q1 - q0, omega=omega,
         pull=np.where(known, -slopes[:, 3].mid, 0.0), rest=np.where(known, rest, 0.0),
         turn=Interval(np.where(known, turn.lo, 0.0), np.where(known, turn.hi, 0.0)),
+        along=Interval(np.where(known, along.lo, 0.0), np.where(known, along.hi, 0.0)),
+        bend=Interval(np.where(single, drift.lo, -np.inf), np.where(single, drift.hi, np.inf)),
         speeds=(np.maximum(-f.lo[:, 0], 0.0) * _UP, np.maximum(f.hi[:, 0], 0.0) * _UP),
         turns=(
             np.where(even & known & falls, drift.lo, np.nan), np.where(even & known & rises, -drift.hi, np.nan)
@@ -167,14 +175,15 @@ def passed(
     above : ndarray, shape (K,)
     s, step : float
     """
-    motion = motion_of(found, k, heights, drift, s, step)
+    motion = motion_of(found, k, heights, drift, rates, s, step)
     within = beyond = np.zeros(len(rates))
     if found.stays[k]:
         within, beyond = -ends.hi, -(found.depth + ends.lo)
         within = at_most(within / np.sqrt(np.where(within < 0, variance.lo, variance.hi))) * (1 - 4e-9)
         beyond = at_most(beyond / np.sqrt(np.where(beyond > 0, variance.lo, variance.hi)))
     best, chosen = np.full(len(rates), np.inf), None
-    for wide in _WIDE if np.isfinite([turn[k] for turn in found.turns]).any() else _WIDE[-1:]:
+    options = _WIDE[_FIRST:] if found.omega > 6 else _WIDE[:-1]
+    for wide in options if np.isfinite([turn[k] for turn in found.turns]).any() else _WIDE[-1:]:
         arrival = arrival_of(found, k, away, rates, s, step, wide, upper=True)
         met, late = dipped(motion, arrival, np.array([-math.inf]), upper=True)[0], arrival.t >= step
         met = np.where(late, met, np.maximum(met - within, 0.0) + beyond)
@@ -186,12 +195,19 @@ def passed(
     return np.minimum(np.vstack([best, higher]) + 4 * float(at_most(np.array(-found.omega))), 1.0)
 
 
-def motion_of(found: Passing, k: int, heights: Interval, drift: Interval, s: float, step: float) -> Motion:
-    """Z on the tubes of starts in a box, ``heights`` and ``drift`` (at the obstacle's end) of parts of it."""
-    rest = float(found.rest[k])
+def motion_of(
+    found: Passing, k: int, heights: Interval, drift: Interval, rates: Interval, s: float, step: float
+) -> Motion:
+    """Z on the tubes of starts in a box; ``heights``, ``drift`` (at the obstacle's end) and ``rates`` (F) of parts of it."""
+    rest, low, high = float(found.rest[k]), found.turn.lo[k], found.turn.hi[k]
+    if math.isfinite(found.bend.lo[k]):  # the mean of F up to u, up to a noise of at most F_q s sup |W|
+        noise = float(found.slope[k]) * s * found.omega * math.sqrt(step) * _UP
+        mean = rates + found.bend[k] * Interval(0.0, step / 2) + Interval(-noise, noise)
+        own = mean * found.along[k]
+        low, high = np.fmax(low, own.lo), np.fmin(high, own.hi)
     return Motion(
-        start=heights, drift=Interval(drift.lo - rest, drift.hi + rest), pull=float(found.pull[k]), s=s, step=step,
-        rate=(float(found.turn.lo[k]), float(found.turn.hi[k])),
+        start=heights, drift=Interval(drift.lo - rest, drift.hi + rest), rate=Interval(low, high) + np.zeros(len(rates)),
+        pull=float(found.pull[k]), s=s, step=step,
     )  # fmt: skip
 
 

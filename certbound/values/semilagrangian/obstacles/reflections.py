@@ -28,18 +28,18 @@ from certbound.arrays import Array, Mask
 from certbound.lazy import compiled
 from certbound.rigor.intervals import Interval
 
-_PIECES, _FEW, _RARELY = 32, 8, 1e-5  # pieces, and how many where hardly any path is
+_PIECES, _FEW, _RARELY = 10, 3, 1e-5  # pieces, and how many where hardly any path is
 _FAR = 6.0
 _SURE = 1e-10  # relative, for every erfc and product
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Motion:
-    """dZ = (drift + rate u - pull Z) du + s dW for u in a step, with bounds of start, drift, shape (N,), and of rate."""
+    """dZ = (drift + rate u - pull Z) du + s dW for u in a step, with bounds of start, drift and rate, shape (N,)."""
 
     start: Interval
     drift: Interval
-    rate: tuple[float, float]
+    rate: Interval
     pull: float
     s: float
     step: float
@@ -80,8 +80,7 @@ def dipped(motion: Motion, arrival: Arrival, above: Array, *, upper: bool) -> Ar
     tau = motion.s**2 * grown(2 * k, t)
     own, others = (("lo", "hi") if upper else ("hi", "lo"))
     start, end, other = _sum(motion, own, t), _sum(motion, own, np.array(h)), _sum(motion, others, np.array(h))
-    most = max(abs(motion.rate[0]), abs(motion.rate[1])) * h
-    slack = 1e-12 * (motion.start.mag + (motion.drift.mag + most) * h * math.exp(4 * abs(k) * h))
+    slack = 1e-12 * (motion.start.mag + (motion.drift.mag + motion.rate.mag * h) * h * math.exp(4 * abs(k) * h))
     sign = -1.0 if upper else 1.0
     move = sign * (_bent(motion, own, -sign) * (last - tau) ** 2 / 8 * (1 + 1e-9) + slack)
     slope = (end - start) / (last - tau)
@@ -101,10 +100,9 @@ def grown(rate: float, t: Array) -> Array:
     return t if rate == 0 else np.asarray(np.expm1(rate * t) / rate)
 
 
-def _rate(motion: Motion, side: str) -> float:
-    growth = math.exp(motion.pull * motion.step)
-    low, high = motion.rate
-    return max(high, high * growth) if side == "hi" else min(low, low * growth)
+def _rate(motion: Motion, side: str) -> Array:
+    rate, growth = getattr(motion.rate, side), math.exp(motion.pull * motion.step)
+    return np.maximum(rate, rate * growth) if side == "hi" else np.minimum(rate, rate * growth)
 
 
 def _sum(motion: Motion, side: str, t: Array) -> Array:
@@ -116,7 +114,7 @@ def _sum(motion: Motion, side: str, t: Array) -> Array:
 def _bent(motion: Motion, side: str, sign: float) -> Array:
     """What ``sign`` d^2A/dtau^2 is at most, or 0: of (rate (1 - 2 pull u) - pull drift e^{pull u}) e^{-4 pull u}/s^4."""
     k, h, rate = motion.pull, motion.step, sign * _rate(motion, side)
-    first = max(rate, rate * (1 - 2 * k * h))
+    first = np.maximum(rate, rate * (1 - 2 * k * h))
     second = -k * sign * getattr(motion.drift, side)
     second = np.maximum(second, second * math.exp(k * h))
     return np.asarray(np.maximum(first + second, 0.0) * max(1.0, math.exp(-4 * k * h)) / motion.s**4)
@@ -134,26 +132,48 @@ def _joint(a: float, m: float, tau: float, last: float, x: float, absent: tuple[
         return _below((a + m * last - x) / math.sqrt(last)) if a <= 0.0 else 0.0
     root, wide = math.sqrt(tau), math.sqrt((last - tau) / tau)
     end, middle = -(a + m * tau) / root, (x - a - m * last) / root
-    low, top = middle - _FAR * wide, min(end, middle + _FAR * wide)
+    low = max(middle - _FAR * wide, min(end, 0.0) - _FAR / (1 + max(-end, 0.0) / 3))
+    top = max(min(end, middle + _FAR * wide, _FAR), low)
     if low >= end:
         return _below(end) * _below((end - middle) / wide) if upper else 0.0
     gap, lean, loose = absent
-    before, place, late = _below(low), low, 0.0 if upper else _below((gap + lean * low) / loose)
-    total = before * _below(-_FAR) if upper else 0.0
     pieces = _PIECES if _below(end) > _RARELY else _FEW
-    for i in range(1, pieces + 2):
-        last_place, last_late = place, late
-        place = low + (top - low) * i / pieces if i < pieces else (top if i == pieces else end)
-        mass = _below(place)
-        if upper:
-            chance = _below((place - middle) / wide + 1e-12)
-            total += max(mass * (1 + _SURE) - before * (1 - _SURE), 0.0) * chance
-        else:
-            late = _below((gap + lean * place) / loose)
-            chance = _below((last_place - middle) / wide - 1e-12) * max(1 - max(late, last_late) * (1 + 1e-8), 0.0)
-            total += max(mass * (1 - _SURE) - before * (1 + _SURE), 0.0) * chance
-        before = mass
+    total = _below(low) * _below((low - middle) / wide) if upper else 0.0
+    late = 0.0 if upper else _below((gap + lean * low) / loose)
+    for half in range(3):  # where the chance rises faster, where slower, and where it is nearly 1
+        bend = max(min(middle, top), low)
+        start = (low, bend, top)[half]
+        width = ((bend, top, end)[half] - start) / (pieces if half < 2 else 1)
+        for i in range(pieces if half < 2 else 1) if width > 0.0 else range(0):
+            one, two = start + i * width, start + (i + 1) * width
+            before, mass = _below(one), _below(two)
+            error = _SURE * (before + mass)
+            mass -= before
+            share = (_density(one) - _density(two) - one * mass) / width  # int (xi - one) over the piece, over its width
+            more = 1e-15 * (1 + abs(one)) * (_density(one) + _density(two) + before) / width
+            if (half == 0) == upper:
+                left, right = _below((one - middle) / wide), _below((two - middle) / wide)
+            else:
+                place = ((one + two) / 2 - middle) / wide
+                left, right = _below(place), _density(place) * width / wide / 2
+                left, right = left - right, left + right
+            if half == 2:
+                left = right = 1.0 if upper else _below((top - middle) / wide)
+            if upper:
+                share = min(max(share + more, 0.0), mass + error)
+                total += left * (mass + error) + (right - left) * share
+            else:
+                before, late = late, _below((gap + lean * two) / loose)
+                share = max(share - more, 0.0)
+                part = left * (mass - error if left > 0.0 else mass + error) + (right - left) * share
+                step = max(mass - error, 0.0) * _below((one - middle) / wide - 1e-12)
+                total += max(part * (1 - _SURE), step) * max(1 - max(late, before) * (1 + 1e-8), 0.0)
     return float(total)
+
+
+@compiled
+def _density(z: float) -> float:
+    return math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
 
 
 @compiled
@@ -162,7 +182,7 @@ def _early(low: float, gap: float, lean: float, loose: float) -> float:
     top = max(low, 0.0) + 9.0
     before, chance = _below(-low), _below(-(gap + lean * low) / loose)
     total = _below(-top)
-    pieces = 2 * _FEW
+    pieces = 6 * _FEW
     for i in range(1, pieces + 1):
         place = low + (top - low) * i / pieces
         now, mass = _below(-(gap + lean * place) / loose), _below(-place)

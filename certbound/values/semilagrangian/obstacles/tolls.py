@@ -11,6 +11,7 @@ bilinear in between, and a cell pays besides what that lacks on one of its parts
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,7 +44,8 @@ class Way:
     paid: Mask
 
 
-_PARTS = (2, 4)  # of a cell, along y and q, from which tolls are asked
+_PARTS, _ROUGH = (8, 2), (2, 1)  # of a cell, along y and q, of which is asked, and where little is found
+_WORTH = 0.01
 _SIDES = ((0, 0), (0, 1), (1, 0), (1, 1))
 _CLOSE = 4.2  # omega of narrower tubes, whose rareness is paid where they are used
 _ABOVE = np.array([0.03, 0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
@@ -113,6 +115,19 @@ class Catch:
         )  # fmt: skip
 
 
+def _caught_from(
+    setting: Setting, clock: Clock, frame: Frame, way: Way, cells: tuple[Index, Index], block: tuple[int, int],
+    above: Array, parts: tuple[int, int],
+) -> Array:  # fmt: skip
+    """`caught` on parts of cells of a block, shape (K, parts times cells)."""
+    p, q, rates = _on_parts(setting, clock, frame, *cells, parts)
+    far = np.nextafter(p.hi - way.ends[1], np.inf), np.nextafter(way.ends[0] - p.lo, np.inf)
+    return caught(
+        way.close, int(way.place[block]), (q - way.found.end) * way.found.sign, _drift(setting, way.found, p), far, rates,
+        above, setting.noise * (1 + setting.spread), clock.step,
+    )  # fmt: skip
+
+
 def catches_of(
     setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
 ) -> list[Catch]:
@@ -125,19 +140,14 @@ def catches_of(
         kept[kept] = way.close.stays[way.place[kept]]
         if not kept.any():
             continue
-        less = np.zeros((*_PARTS, len(above), *frame.live.shape))
+        less = np.zeros((len(above), *_PARTS, *frame.live.shape))
         for i, j in np.argwhere(kept):
             rows, columns = _cells(frame, starts, i, j)
             if not len(rows):
                 continue
-            p, here, rates = _on_parts(setting, clock, frame, rows, columns)
-            far = np.nextafter(p.hi - way.ends[1], np.inf), np.nextafter(way.ends[0] - p.lo, np.inf)
-            chance = caught(
-                way.close, int(way.place[i, j]), (here - way.found.end) * way.found.sign,
-                _drift(setting, way.found, p), far, rates, above, s, clock.step,
-            )  # fmt: skip
-            chance = np.moveaxis(chance.reshape(len(above), *_PARTS, len(rows)), 0, 2)
-            less[..., rows, columns] = -chance
+            less[..., rows, columns] = -_refined(lambda parts: _caught_from(
+                setting, clock, frame, way, (rows, columns), (int(i), int(j)), above, parts
+            ), len(rows))  # fmt: skip
         tall = float(q_tube.lo[kept].min()), float(q_tube.hi[kept].max())
         ends = max(float(p_tube.lo[kept].min()), way.ends[0]), min(float(p_tube.hi[kept].max()), way.ends[1])
         slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
@@ -146,7 +156,7 @@ def catches_of(
         p = y[:, None] + (q * clock.shear)[None]
         high = ((q - way.found.end) * way.found.sign).hi
         near = (p.hi >= ends[0]) & (p.lo <= ends[1]) & (q.hi >= tall[0]) & (q.lo <= tall[1])
-        nodal, lacks = (np.stack(part) for part in zip(*(_shared(less[:, :, k]) for k in range(len(above)))))
+        nodal, lacks = (np.stack(part) for part in zip(*(_shared(part) for part in less)))
         catches.append(Catch(nodal=-nodal, lacks=lacks, places=near & (high >= above[:, None])[:, None]))
     return catches
 
@@ -157,13 +167,21 @@ def _cells(frame: Frame, starts: tuple[Index, Index], i: int, j: int) -> tuple[I
     return rows + starts[0][i], columns + starts[1][j]
 
 
+def _refined(rough: Callable[[tuple[int, int]], Array], rows: int) -> Array:
+    """What is found on parts of cells, shape (K, *_PARTS, rows): on rough ones where it is little."""
+    found = rough(_ROUGH).reshape(-1, *_ROUGH, rows)
+    if found[0].max() > _WORTH:
+        return rough(_PARTS).reshape(-1, *_PARTS, rows)
+    return np.repeat(np.repeat(found, _PARTS[0] // _ROUGH[0], axis=1), _PARTS[1] // _ROUGH[1], axis=2)
+
+
 def _on_parts(
-    setting: Setting, clock: Clock, frame: Frame, rows: Index, columns: Index
+    setting: Setting, clock: Clock, frame: Frame, rows: Index, columns: Index, parts: tuple[int, int]
 ) -> tuple[Interval, Interval, Interval]:
     """p, q and F on all parts of cells, part by part."""
     y, q = Interval(frame.y[rows], frame.y[rows + 1]), Interval(frame.q[columns], frame.q[columns + 1])
     y, q = (
-        concatenate([_part(ends, part[axis], _PARTS[axis]) for part in np.ndindex(*_PARTS)])
+        concatenate([_part(ends, part[axis], parts[axis]) for part in np.ndindex(*parts)])
         for axis, ends in enumerate((y, q))
     )
     p = y + q * clock.shear
@@ -215,7 +233,7 @@ def tolls_of(
     setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
 ) -> list[Toll]:
     """What is paid for obstacles; ``starts``: the blocks' first cells, and the number of cells."""
-    s, found = setting.noise * (1 + setting.spread), []
+    found = []
     bent = frame.bends[1] * np.diff(frame.y)[:, None] ** 2 + frame.bends[3] * np.diff(frame.q) ** 2
     bent = bent / 8 * (1 + 1e-9) + 1e-14
     bent = bent + over_corners(np.maximum, frame.radius[1]) + 1e-13 * over_corners(np.maximum, np.abs(frame.image[1]))
@@ -223,41 +241,51 @@ def tolls_of(
     spread = tuple(np.repeat(np.arange(len(part) - 1), np.diff(part)) for part in starts)
     for ways in (ways for ways in every if ways):
         total = np.zeros((1 + len(above), *_PARTS, *frame.live.shape))
-        chosen, side = np.zeros((2, *ways[0].paid.shape), dtype=int), np.zeros(ways[0].paid.shape, dtype=int)
+        side = np.zeros(ways[0].paid.shape, dtype=int)
         for i, j in np.argwhere(np.any([way.paid for way in ways], axis=0)):
             rows, columns = _cells(frame, starts, i, j)
             if not len(rows):
                 continue
-            most = np.tile(float(blocks.strays.most[1][i, j]) + bent[rows, columns], math.prod(_PARTS))
-            p, q, rates = _on_parts(setting, clock, frame, rows, columns)
-            corners_of = np.stack([
-                np.concatenate([_between(frame.image[1], rows, columns, part, side) for part in np.ndindex(*_PARTS)])
-                for side in _SIDES
-            ])  # fmt: skip
-            image = Interval(corners_of.min(axis=0) - most, corners_of.max(axis=0) + most)
-            ends = ways[0].ends
-            away = np.nextafter(p.lo - ends[1], -np.inf), np.nextafter(ends[0] - p.hi, -np.inf)
+            more = float(blocks.strays.most[1][i, j]) + bent[rows, columns]
             options = []
-            for way in ways:
-                if not way.paid[i, j]:
-                    continue
-                sign, end, k = way.found.sign, way.found.end, int(way.place[i, j])
-                due = np.ones((1 + len(above), len(p)))
-                for one in (way.found, way.close):
-                    if one.known[k]:
-                        due = np.minimum(due, passed(
-                            one, k, (q - end) * sign, _drift(setting, one, p), away, rates, (image - end) * sign,
-                            blocks.covariance[2][i, j], above, s, clock.step,
-                        ))  # fmt: skip
-                options.append((float(due.sum()), int(sign > 0), due))
+            for way in (way for way in ways if way.paid[i, j]):
+                due = _refined(lambda parts: _passed_from(
+                    setting, clock, frame, way, (rows, columns), (int(i), int(j)), above, parts, more,
+                    blocks.covariance[2][i, j],
+                ), len(rows))  # fmt: skip
+                options.append((float(due.sum()), int(way.found.sign > 0), due))
             side[i, j], due = min(options)[1:]
-            total[..., rows, columns] = due.reshape(-1, *_PARTS, len(rows))
+            total[..., rows, columns] = due
         nodal, lacks = (np.stack(part) for part in zip(*(_shared(part) for part in total)))
         found.append(Toll(
             nodal=nodal, lacks=lacks, rows=_landing(clock, frame, blocks, ways, above), side=side, spread=spread,
             columns=_beside(frame, ways, above),
         ))  # fmt: skip
     return found
+
+
+def _passed_from(
+    setting: Setting, clock: Clock, frame: Frame, way: Way, cells: tuple[Index, Index], block: tuple[int, int],
+    above: Array, parts: tuple[int, int], more: Array, variance: Interval,
+) -> Array:  # fmt: skip
+    """`passed` on parts of cells of a block, shape (1 + K, parts times cells); ``more``: what images are off by."""
+    p, q, rates = _on_parts(setting, clock, frame, *cells, parts)
+    ends = np.stack([
+        np.concatenate([_between(frame.image[1], *cells, part, parts, side) for part in np.ndindex(*parts)])
+        for side in _SIDES
+    ])  # fmt: skip
+    most = np.tile(more, math.prod(parts))
+    image = Interval(ends.min(axis=0) - most, ends.max(axis=0) + most)
+    away = np.nextafter(p.lo - way.ends[1], -np.inf), np.nextafter(way.ends[0] - p.hi, -np.inf)
+    sign, end, k = way.found.sign, way.found.end, int(way.place[block])
+    due = np.ones((1 + len(above), len(p)))
+    for found in (way.found, way.close):
+        if found.known[k]:
+            due = np.minimum(due, passed(
+                found, k, (q - end) * sign, _drift(setting, found, p), away, rates, (image - end) * sign, variance, above,
+                setting.noise * (1 + setting.spread), clock.step,
+            ))  # fmt: skip
+    return due
 
 
 def _landing(clock: Clock, frame: Frame, blocks: Blocks, ways: list[Way], above: Array) -> Index:
@@ -280,9 +308,11 @@ def _beside(frame: Frame, ways: list[Way], above: Array) -> Mask:
     return found
 
 
-def _between(table: Array, rows: Index, columns: Index, part: tuple[int, ...], side: tuple[int, int]) -> Array:
+def _between(
+    table: Array, rows: Index, columns: Index, part: tuple[int, ...], parts: tuple[int, int], side: tuple[int, int]
+) -> Array:
     """A bilinear function, given at nodes, at a corner of one of the parts of cells."""
-    t, r = ((part[k] + side[k]) / _PARTS[k] for k in (0, 1))
+    t, r = ((part[k] + side[k]) / parts[k] for k in (0, 1))
     low, high = ((1 - r) * table[rows + k, columns] + r * table[rows + k, columns + 1] for k in (0, 1))
     return np.asarray((1 - t) * low + t * high)
 
@@ -296,6 +326,6 @@ def _shared(due: Array) -> tuple[Array, Array]:
     lacks = np.zeros(due.shape[2:])
     rows, columns = np.nonzero(due.any(axis=(0, 1)))
     for part in np.ndindex(*_PARTS):
-        least = np.min([_between(nodal, rows, columns, part, side) for side in _SIDES], axis=0)
+        least = np.min([_between(nodal, rows, columns, part, _PARTS, side) for side in _SIDES], axis=0)
         lacks[rows, columns] = np.maximum(lacks[rows, columns], due[(*part, rows, columns)] - least + 1e-12 * np.abs(least))
     return nodal, lacks
