@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.obstacles import Catch, Toll
 from certbound.values.semilagrangian.smoothing import Lines
+
+_SLICES = 16  # of a column of cells, over which starts are gone through: a ball is a box over each
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -130,14 +133,15 @@ def highest(frame: Frame, value: Lines, setting: Setting, shear: float) -> float
     first = max(int(np.searchsorted(frame.q, low, side="right")) - 1, 0)
     last = min(int(np.searchsorted(frame.q, high)), len(frame.q) - 1)
     for j in range(first, max(last, first + 1)):
-        q = max(low, frame.q[j]), min(high, frame.q[j + 1])
-        p = setting.starts_between(*q)
-        ends = sorted((shear * q[0], shear * q[1]))
-        slack = 1e-14 * (1 + abs(p[0]) + abs(p[1]))
-        y = (p[0] - ends[1] - slack, p[1] - ends[0] + slack)
-        if y[0] < frame.y[0] or y[1] > frame.y[-1]:
-            return 1.0
-        best = max(best, _over_strip(frame, value, j, q, y))
+        ends = np.linspace(max(low, frame.q[j]), min(high, frame.q[j + 1]), _SLICES + 1)
+        for q in itertools.pairwise(ends.tolist()):
+            p = setting.starts_between(*q)
+            away = sorted((shear * q[0], shear * q[1]))
+            slack = 1e-14 * (1 + abs(p[0]) + abs(p[1]))
+            y = (p[0] - away[1] - slack, p[1] - away[0] + slack)
+            if y[0] < frame.y[0] or y[1] > frame.y[-1]:
+                return 1.0
+            best = max(best, _over_strip(frame, value, j, q, y))
     return best
 
 
