@@ -1,14 +1,14 @@
 """How probable it is at least that a path meets an obstacle within a step and ends beside it (lower bounds).
 
 As in ``passings``, Z is the distance of q from an end of the obstacle [p0, p1] x [q0, q1], and p stays in [p0, p1] once
-it is there. If p is there at the time t, Z <= 0 somewhere in [t, h] and Z_h > z >= 0, the path goes through Z = 0 in [t, h]
-and meets the obstacle, so that for every t
+it is there. If p is there at the time t, Z <= 0 somewhere in [t, h] and Z_h > z >= 0, the path goes through Z = 0 in
+[t, h] and meets the obstacle. So for every t
 
-    P(meets it, ends with Z_h > z) >= P(Z <= 0 somewhere in [t, h], Z_h > z) - P(p_t outside of [p0, p1]).
+    P(meets it, ends with Z_h > z) >= P(Z <= 0 somewhere in [t, h], Z_h > z, p_t in [p0, p1]),
 
-The first is bounded by ``reflections``. Where p falls and dF <= c dt + a s dW the distance of p from p1 is at most away +
-F_0 t + c t^2/2 + a s int W, whose last part has variance (a s)^2 t^3/3; without c, speeds bound it. Probabilities of leaving
-the tube are taken off. The largest bound of a few t is taken.
+which ``reflections`` bounds from below, less the probability of leaving the tube. Where p falls and dF <= c dt + a s dW
+the distance of p from p1 is at most away + F_0 t + c t^2/2 + a s int W (`arrival_of`); without c, speeds bound it. The
+largest bound of a few t is taken.
 """
 
 from __future__ import annotations

@@ -7,22 +7,19 @@ obstacle, and let p not be in [p0, p1] before the time t. A path that meets the 
 
     P(meets it, ends outside) <= P(Z <= 0 at some time in [t, h]) - P(Z_h <= 0) + P(Z_h < -depth).
 
+and P(meets it, ends outside, not with 0 < Z_h <= z) <= P(Z <= 0 at some time in [t, h], Z_h > z) + P(Z_h < -depth).
 Each holds on the event of `remainders`; what is taken off may be too much by its share, for which `leaving._RARE` has
-room.
+room. Narrower tubes give sharper bounds, and their rareness is added.
 
-*The first*: Z is at least the solution Y of dY = (push - pull Y) dt + s dW, Y_0 the least Z of the starts, since Z' is
-at least that on the tube. Y_t is normal. From y > 0 on, Y meets 0 with a probability of at most c(y) (`meeting`), which
-falls: its mean is at most the sum of c's falls at y_1 < y_2 < ... times P(Y_t < y_i), with c = 1 up to 0. Only h - t is
-left to do so: c is that of the next larger one of h, h/sqrt(2), h/2, ...
+*Z* (`motion_of`): on the tube Z' is the drift at the end less pull Z, but for rest. The drift at the end is that for the
+start's p, and changes at a rate within ``turn``; where F has one sign and dF = c dt + a s dW, also at most at the mean of
+F up to then, within F_0 + c u/2 +- |a| s sup |W|, times what p changes it by. ``reflections`` bounds the rest.
 
-The drift at the end is that for the start's p, and changes at a rate within ``turn``: where that gives a larger mean of
-Y, it is taken (`least_mean`).
-
-*The time t* (`_arrival`): |F| bounds it. Where F <= 0 all along and F_q is a constant a, dF >= c dt + a s dW, so that
-p_u >= p_0 + F_0 u + c u^2/2 - |a| s |int W|, and int W up to u is normal with variance u^3/3. As p only falls, p_t > p1
-tells that p was above p1 before: true but for a share Phi(-w) of the paths, if t is the first root of
-away - (r - F_0) t + c t^2/2 with r = |a| s w sqrt(u/3) for a u >= t. The share is added; P(Z_h <= 0) is taken off where
-t <= h only. All w are valid, and the least bound is taken.
+*The time t* (`arrival_of`): |F| bounds it. Where F <= 0 all along and F_q is a constant a, dF >= c dt + a s dW, so that
+p_u >= p_0 + F_0 u + c u^2/2 + a s int W, and int W up to u is normal with variance u^3/3. As p only falls, p_t > p1 tells
+that p was above p1 before, and given the noise M_t of Z, with xi deviations, int W is normal with mean
+xi int (t - v) e^{pull v} dv / sqrt(int e^{2 pull v} dv) (with a sign): who is early counts, given xi. All t are valid,
+and the least bound of a few is taken; P(Z_h <= 0) is taken off where t < h only.
 
 *The others*: Z_h is the end of the flow plus a normal law plus the remainder (``remainders``).
 """
@@ -44,6 +41,7 @@ from certbound.values.semilagrangian.obstacles.reflections import Arrival, Motio
 _UP = 1 + 1e-9
 _WIDE = (1.0, 1.7, 2.6, 3.8, math.inf)
 _FIRST = 2  # from which of them on wide tubes are asked, with which nothing is paid
+_LITTLE = 1e-3  # of which it does not matter where it ends
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -59,8 +57,8 @@ class Passing:
     pull, rest : ndarray
         Z' is the drift at the end less pull Z, but for so much.
     turn, along, bend : Interval
-        How fast the drift of q at the end changes, along Z, and that by p; the drift of F, where F_q is constant and F has
-        one sign.
+        How fast the drift of q at the end changes, along Z, and how it does with p; the drift of F, where F_q is
+        constant and F has one sign.
     speeds : (ndarray, ndarray)
         How fast p falls and rises at most.
     turns : (ndarray, ndarray)
@@ -145,7 +143,8 @@ def passing(
         slowed=(
             np.where(even & known & falls, drift.hi, np.nan), np.where(even & known & rises, -drift.lo, np.nan)
         ),
-        slope=slopes[:, 1].mag, tilt=slopes[:, 1].mid, stays=((p.lo >= p0) | rises) & ((p.hi <= p1) | falls) & known, known=known,
+        slope=slopes[:, 1].mag, tilt=slopes[:, 1].mid, known=known,
+        stays=((p.lo >= p0) | rises) & ((p.hi <= p1) | falls) & known,
     )  # fmt: skip
 
 
@@ -190,7 +189,7 @@ def passed(
         chosen = arrival if chosen is None else chosen.where(best <= met, arrival)
         best = np.minimum(best, met)
     higher = np.broadcast_to(best, (len(above), len(best)))
-    if found.stays[k] and chosen is not None:
+    if found.stays[k] and chosen is not None and best.max() > _LITTLE:
         higher = np.minimum(best, dipped(motion, chosen, above, upper=True) + beyond)
     return np.minimum(np.vstack([best, higher]) + 4 * float(at_most(np.array(-found.omega))), 1.0)
 
@@ -198,7 +197,7 @@ def passed(
 def motion_of(
     found: Passing, k: int, heights: Interval, drift: Interval, rates: Interval, s: float, step: float
 ) -> Motion:
-    """Z on the tubes of starts in a box; ``heights``, ``drift`` (at the obstacle's end) and ``rates`` (F) of parts of it."""
+    """Z on the tubes of a box of starts; of parts of it ``heights``, ``drift`` (at the obstacle's end), ``rates`` (F)."""
     rest, low, high = float(found.rest[k]), found.turn.lo[k], found.turn.hi[k]
     if math.isfinite(found.bend.lo[k]):  # the mean of F up to u, up to a noise of at most F_q s sup |W|
         noise = float(found.slope[k]) * s * found.omega * math.sqrt(step) * _UP
@@ -206,13 +205,14 @@ def motion_of(
         own = mean * found.along[k]
         low, high = np.fmax(low, own.lo), np.fmin(high, own.hi)
     return Motion(
-        start=heights, drift=Interval(drift.lo - rest, drift.hi + rest), rate=Interval(low, high) + np.zeros(len(rates)),
-        pull=float(found.pull[k]), s=s, step=step,
+        start=heights, drift=Interval(drift.lo - rest, drift.hi + rest), pull=float(found.pull[k]), s=s, step=step,
+        rate=Interval(np.minimum(low, high), high) + np.zeros(len(rates)),
     )  # fmt: skip
 
 
 def arrival_of(
-    found: Passing, k: int, parts: tuple[Array, Array], rates: Interval, s: float, step: float, wide: float, *, upper: bool
+    found: Passing, k: int, parts: tuple[Array, Array], rates: Interval, s: float, step: float, wide: float, *,
+    upper: bool,
 ) -> Arrival:  # fmt: skip
     """When p has come to be between the obstacle's ends: up to ``wide`` deviations earlier (``upper``) or later.
 
@@ -232,7 +232,7 @@ def arrival_of(
     for part, speed, turn, start, turned in zip(parts, speeds, turns, starts, (1.0, -1.0)):
         out = part > 0
         with np.errstate(all="ignore"):
-            first = part / float(speed[k])
+            first = part / float(speed[k]) * (1 + late * 1e-9)
             own = np.full(len(rates), sure)
             if math.isfinite(turn[k]) and math.isfinite(wide):
                 time, noise = np.full(len(rates), step), float(found.slope[k]) * s * wide

@@ -1,20 +1,24 @@
 """How probable it is that Z <= 0 at some time in [t, h] and Z_h > z at the end of the step: from above and from below.
 
-Let Z lie between Y and Y', the solutions of dY = (drift + rate u - pull Y) du + s dW with the least and the largest start,
-drift and rate. M_u = s int e^{pull v} dW is a Brownian motion in the time tau(u) = s^2 int e^{2 pull v} dv, and e^{pull u} Y_u =
-M_u + A(u), A(u) = Y_0 + drift int e^{pull v} dv + rate int v e^{pull v} dv; the last integral is u^2/2 up to a factor between
-1 and e^{pull h}, which is given to rate. Let A + M belong to Y, A' + M to Y'.
+Let Z lie between Y and Y', the solutions of dY = (drift + rate u - pull Y) du + s dW with the least and the largest
+start, drift and rate. M_u = s int e^{pull v} dW is a Brownian motion in the time tau(u) = s^2 int e^{2 pull v} dv, and
+e^{pull u} Y_u = M_u + A(u), A(u) = Y_0 + drift int e^{pull v} dv + rate int v e^{pull v} dv; the last integral is u^2/2
+up to a factor between 1 and e^{pull h}, which is given to rate. Let A + M belong to Y, A' + M to Y'.
 
-A line a + m tau that lies above A' on [t, h] serves for lower bounds, one below A for upper bounds: the chord, moved by
-(tau_h - tau_t)^2/8 times what d^2A/dtau^2 is at least (at most). Let V = M + a + m tau. From below, V <= 0 somewhere in
-[t, h] and M_h > e^{pull h} z - A(h) will do; from above both are needed, the last one with A'(h). V is a Brownian
+*A line* a + m tau that lies above A' on [t, h] serves for lower bounds, one below A for upper bounds: the chord, moved
+by (tau_h - tau_t)^2/8 times what d^2A/dtau^2 is at least (at most). Let V = M + a + m tau. From below, V <= 0 somewhere
+in [t, h] and M_h > e^{pull h} z - A(h) will do; from above both are needed, the last one with A'(h). V is a Brownian
 motion with the drift m. Given V_t = v > 0, by the reflection principle, for x >= 0
 
     P(V <= 0 somewhere in [t, h], V_h > x) = e^{-2 m v} P(N(m r - v, r) > x),   r = tau_h - tau_t,
 
 and e^{-2 m v} times the density of V_t at v is e^{-2 m a} times that at -v of the motion from -a. So it is
-B(a) + e^{-2 m a} B(-a) without the condition, B(a) = P(V_t <= 0, V_h > x | V_0 = a). B is an integral over V_t, of a function
-that rises: bounded by sums over pieces.
+B(a) + e^{-2 m a} B(-a) without the condition, B(a) = P(V_t <= 0, V_h > x | V_0 = a), an integral of phi(xi) times
+Phi((xi - c)/kappa): on pieces Phi lies between its chord and a tangent, and mass and first moment of phi are known.
+
+*Who is there* at t (`Arrival`) depends on xi = M_t/sqrt(tau_t). From below, a share of who is not is left out of every
+piece; the reflected xi is -xi - 2 m sqrt(tau_t). From above, who was there before t and has V_t > 0 is added, since
+V_t <= 0 has been counted.
 """
 
 from __future__ import annotations
@@ -89,9 +93,11 @@ def dipped(motion: Motion, arrival: Arrival, above: Array, *, upper: bool) -> Ar
     absent = np.stack([arrival.gap, arrival.lean, np.maximum(arrival.loose, 1e-300)])
     found = _hits(start + move - slope * tau, slope, tau, float(last), beyond, slack, absent, upper)
     if upper:  # who is there by the end only: all of those, whatever Z does
-        loose = np.sqrt(arrival.lean**2 + arrival.loose**2)
-        never = [0.5 * math.erfc(gap) for gap in (arrival.gap / np.maximum(loose, 1e-300) / math.sqrt(2)).tolist()]
-        return np.where(arrival.t >= h, np.array(never) * (1 + 1e-8) + 1e-300, found)
+        late = np.flatnonzero(arrival.t >= h)
+        loose = np.sqrt(arrival.lean[late] ** 2 + arrival.loose[late] ** 2)
+        gaps = (arrival.gap[late] / np.maximum(loose, 1e-300) / math.sqrt(2)).tolist()
+        found[:, late] = np.array([0.5 * math.erfc(gap) for gap in gaps]) * (1 + 1e-8) + 1e-300
+        return np.asarray(found)
     return np.where(arrival.t > h * (1 - 1e-6), 0.0, found)
 
 
@@ -101,8 +107,9 @@ def grown(rate: float, t: Array) -> Array:
 
 
 def _rate(motion: Motion, side: str) -> Array:
-    rate, growth = getattr(motion.rate, side), math.exp(motion.pull * motion.step)
-    return np.maximum(rate, rate * growth) if side == "hi" else np.minimum(rate, rate * growth)
+    pick = np.maximum if side == "hi" else np.minimum
+    rate: Array = getattr(motion.rate, side)
+    return np.asarray(pick(rate, rate * math.exp(motion.pull * motion.step)))
 
 
 def _sum(motion: Motion, side: str, t: Array) -> Array:
@@ -112,7 +119,7 @@ def _sum(motion: Motion, side: str, t: Array) -> Array:
 
 
 def _bent(motion: Motion, side: str, sign: float) -> Array:
-    """What ``sign`` d^2A/dtau^2 is at most, or 0: of (rate (1 - 2 pull u) - pull drift e^{pull u}) e^{-4 pull u}/s^4."""
+    """What ``sign`` d^2A/dtau^2 is at most, or 0: (rate (1 - 2 pull u) - pull drift e^{pull u}) e^{-4 pull u}/s^4."""
     k, h, rate = motion.pull, motion.step, sign * _rate(motion, side)
     first = np.maximum(rate, rate * (1 - 2 * k * h))
     second = -k * sign * getattr(motion.drift, side)
@@ -126,7 +133,9 @@ def _below(z: float) -> float:
 
 
 @compiled
-def _joint(a: float, m: float, tau: float, last: float, x: float, absent: tuple[float, float, float], upper: bool) -> float:
+def _joint(
+    a: float, m: float, tau: float, last: float, x: float, absent: tuple[float, float, float], upper: bool
+) -> float:
     """B(a) from above, or from below and without a share Phi((gap + lean xi)/loose) of who is at xi deviations."""
     if tau <= 0.0:
         return _below((a + m * last - x) / math.sqrt(last)) if a <= 0.0 else 0.0
@@ -149,7 +158,7 @@ def _joint(a: float, m: float, tau: float, last: float, x: float, absent: tuple[
             before, mass = _below(one), _below(two)
             error = _SURE * (before + mass)
             mass -= before
-            share = (_density(one) - _density(two) - one * mass) / width  # int (xi - one) over the piece, over its width
+            share = (_density(one) - _density(two) - one * mass) / width  # the first moment
             more = 1e-15 * (1 + abs(one)) * (_density(one) + _density(two) + before) / width
             if (half == 0) == upper:
                 left, right = _below((one - middle) / wide), _below((two - middle) / wide)
@@ -201,13 +210,12 @@ def _hits(
     for n in range(len(first)):
         a, m, tau = first[n], slope[n], times[n]
         power = -2 * m * a + (2 if upper else -2) * abs(m) * slack[n]
-        gap, lean, loose = absent[0, n], absent[1, n], absent[2, n]
+        gap, lean, loose, root = absent[0, n], absent[1, n], absent[2, n], max(math.sqrt(tau), 1e-300)
         turned = gap - 2 * lean * m * math.sqrt(tau), -lean, loose
-        more = _early(-(a + m * tau) / math.sqrt(tau), gap, lean, loose) if upper and tau > 0.0 and gap < 1e300 else 0.0
-        if not upper and _below(-(a + m * tau) / max(math.sqrt(tau), 1e-300)) < _RARELY and a > 0.0:
-            if math.exp(min(power, 0.0)) * _below((a - m * tau) / max(math.sqrt(tau), 1e-300)) < _RARELY:
-                found[:, n] = 0.0  # too little to count
-                continue
+        more = _early(-(a + m * tau) / root, gap, lean, loose) if upper and tau > 0.0 and gap < 1e300 else 0.0
+        if not upper and a > 0.0 and _below(-(a + m * tau) / root) < _RARELY and power < -12.0:
+            found[:, n] = 0.0  # too little to count
+            continue
         for k in range(len(beyond)):
             x = max(beyond[k, n], 0.0)
             total = more + _joint(a, m, tau, last, x, (gap, lean, loose), upper)
@@ -215,10 +223,10 @@ def _hits(
                 other = _joint(-a, m, tau, last, x, turned, upper) + (1e-300 if upper else 0.0)
                 total += math.exp(min(power, 600.0)) * other if power < 600.0 or not upper else 1.0
             if beyond[k, n] < 0.0:
-                middle, root = a + m * last, math.sqrt(last)
-                total += _below(-middle / root) * (1 + _SURE)
+                middle, wide = a + m * last, math.sqrt(last)
+                total += _below(-middle / wide) * (1 + _SURE)
                 if beyond[k, n] > -1e300:
-                    total -= _below((beyond[k, n] - middle) / root) * (1 - _SURE)
+                    total -= _below((beyond[k, n] - middle) / wide) * (1 - _SURE)
             found[k, n] = min(max(total, 0.0) * share, 1.0)
             if upper:
                 found[k, n] += 1e-300

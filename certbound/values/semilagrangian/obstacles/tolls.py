@@ -1,8 +1,12 @@
 """What the grid's cells pay for paths that meet an obstacle along the coordinates within a step and end beside it.
 
-From below they are paid: of who meets it and ends at a height Z_h > z_k above it L counts at most M_k, the most in all
-places of such ends, and u counts 1. With M_0 = 1 and M_k falling, sum_k (M_{k-1} - M_k) 1{Z_h > z_k} <= 1 - L there, so
-that u >= E L + sum_k (M_{k-1} - M_k) P(meets it, Z_h > z_k).
+From above (`Toll`) such a path is to count 1, and U has been counted where it ends. So 1 - U is paid: with m_k at most
+U wherever it may end at 0 < Z_h <= z_k (1 = m_0 >= m_1 >= ... >= m_{K+1} = 0), that is at most
+sum_k (m_k - m_{k+1}) P(meets it, ends outside, not with 0 < Z_h <= z_k), z_0 = 0, by Abel's summation.
+
+From below (`Catch`) they are paid: of who meets it and ends at a height Z_h > z_k above it L counts at most M_k, the
+most in all places of such ends, and u counts 1. With M_0 = 1 and M_k falling, sum_k (M_{k-1} - M_k) 1{Z_h > z_k} <=
+1 - L there, so that u >= E L + sum_k (M_{k-1} - M_k) P(meets it, Z_h > z_k), summed over both ends.
 
 Tolls fall by a part over a cell. They are asked of parts of cells, nodes pay what the parts around them ask, which is
 bilinear in between, and a cell pays besides what that lacks on one of its parts, where it is least at a corner.
@@ -13,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -33,8 +38,8 @@ from certbound.values.semilagrangian.remainders import remainders
 class Way:
     """Past one end along q of an obstacle, whose ``ends`` in p these are.
 
-    ``paid`` says from which blocks, shape (blocks of y, blocks of q), and ``place`` where these are in ``found``, and in
-    ``close``: the same on narrower tubes.
+    ``paid`` says from which blocks, shape (blocks of y, blocks of q), and ``place`` where these are in ``found``, and
+    in ``close``: the same on narrower tubes.
     """
 
     ends: Ends
@@ -45,7 +50,7 @@ class Way:
 
 
 _PARTS, _ROUGH = (8, 2), (2, 1)  # of a cell, along y and q, of which is asked, and where little is found
-_WORTH = 0.01
+_WORTH, _LITTLE = 0.01, 1e-4
 _SIDES = ((0, 0), (0, 1), (1, 0), (1, 1))
 _CLOSE = 4.2  # omega of narrower tubes, whose rareness is paid where they are used
 _ABOVE = np.array([0.03, 0.12, 0.35, 0.8])  # heights, in deviations of a step's noise
@@ -56,10 +61,10 @@ _UP_TO = np.array([0.06, 0.15, 0.3, 0.6])
 class Toll:
     """What is paid for paths that meet an obstacle within a step and end beside it.
 
-    ``nodal``, shape (1 + K, ny, nq), bilinear in between, and ``lacks``, shape (1 + K, ny - 1, nq - 1), on cells: who does,
-    and who ends more than K heights beyond its end. ``rows``, shape (2, blocks): on which cells of y those come down, and
-    ``columns``, shape (2, K, nq - 1), on which of q, by end; ``side`` which end, shape (blocks), and ``spread`` the blocks of
-    cells of y and q.
+    ``nodal``, shape (1 + K, ny, nq), bilinear in between, and ``lacks``, shape (1 + K, ny - 1, nq - 1), on cells: who
+    does, and who does and does not end up to K heights beyond its end. ``rows``, shape (2, *blocks): first and last
+    (excluded) cell of y in which they end, ``columns``, shape (2, K, nq - 1), which cells of q those heights touch, by
+    end; ``side``, shape blocks: which end; ``spread``: the blocks of cells of y and q.
     """
 
     nodal: Array
@@ -93,8 +98,8 @@ class Toll:
 class Catch:
     """Who is caught within a step and ends beside an obstacle, at one of its ends along q.
 
-    ``nodal``, shape (K, ny, nq), bilinear in between, less ``lacks``, shape (K, ny - 1, nq - 1), on cells, are lower bounds
-    for K heights, and ``places`` the cells in which who ends above them may be.
+    ``nodal``, shape (K, ny, nq), bilinear in between, less ``lacks``, shape (K, ny - 1, nq - 1), on cells, are lower
+    bounds for K heights, and ``places`` the cells in which who ends above them may be.
     """
 
     nodal: Array
@@ -116,15 +121,15 @@ class Catch:
 
 
 def _caught_from(
-    setting: Setting, clock: Clock, frame: Frame, way: Way, cells: tuple[Index, Index], block: tuple[int, int],
-    above: Array, parts: tuple[int, int],
+    setting: Setting, clock: Clock, frame: Frame, way: Way, k: int, cells: tuple[Index, Index], above: Array,
+    parts: tuple[int, int],
 ) -> Array:  # fmt: skip
-    """`caught` on parts of cells of a block, shape (K, parts times cells)."""
+    """`caught` on parts of cells of the ``k``-th block, shape (K, parts times cells)."""
     p, q, rates = _on_parts(setting, clock, frame, *cells, parts)
     far = np.nextafter(p.hi - way.ends[1], np.inf), np.nextafter(way.ends[0] - p.lo, np.inf)
     return caught(
-        way.close, int(way.place[block]), (q - way.found.end) * way.found.sign, _drift(setting, way.found, p), far, rates,
-        above, setting.noise * (1 + setting.spread), clock.step,
+        way.close, k, (q - way.found.end) * way.found.sign, _drift(setting, way.found, p), far, rates, above,
+        setting.noise * (1 + setting.spread), clock.step,
     )  # fmt: skip
 
 
@@ -132,7 +137,7 @@ def catches_of(
     setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
 ) -> list[Catch]:
     """What cells are paid from below, end by end of the first obstacle with any; as `tolls_of`."""
-    s, (p_tube, q_tube) = setting.noise * (1 + setting.spread), blocks.strays.tube
+    (p_tube, q_tube) = blocks.strays.tube
     above, faces, catches = _ABOVE * setting.noise * math.sqrt(clock.step), setting.faces[1], []
     y, q = Interval(frame.y[:-1], frame.y[1:]), Interval(frame.q[:-1], frame.q[1:])
     for way in (way for ways in every for way in ways):
@@ -145,9 +150,8 @@ def catches_of(
             rows, columns = _cells(frame, starts, i, j)
             if not len(rows):
                 continue
-            less[..., rows, columns] = -_refined(lambda parts: _caught_from(
-                setting, clock, frame, way, (rows, columns), (int(i), int(j)), above, parts
-            ), len(rows))  # fmt: skip
+            asked = partial(_caught_from, setting, clock, frame, way, int(way.place[i, j]), (rows, columns), above)
+            less[..., rows, columns] = -_refined(asked, np.maximum, len(rows))
         tall = float(q_tube.lo[kept].min()), float(q_tube.hi[kept].max())
         ends = max(float(p_tube.lo[kept].min()), way.ends[0]), min(float(p_tube.hi[kept].max()), way.ends[1])
         slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
@@ -167,12 +171,12 @@ def _cells(frame: Frame, starts: tuple[Index, Index], i: int, j: int) -> tuple[I
     return rows + starts[0][i], columns + starts[1][j]
 
 
-def _refined(rough: Callable[[tuple[int, int]], Array], rows: int) -> Array:
-    """What is found on parts of cells, shape (K, *_PARTS, rows): on rough ones where it is little."""
-    found = rough(_ROUGH).reshape(-1, *_ROUGH, rows)
-    if found[0].max() > _WORTH:
-        return rough(_PARTS).reshape(-1, *_PARTS, rows)
-    return np.repeat(np.repeat(found, _PARTS[0] // _ROUGH[0], axis=1), _PARTS[1] // _ROUGH[1], axis=2)
+def _refined(asked: Callable[[tuple[int, int]], Array], pick: np.ufunc, rows: int) -> Array:
+    """What is found on parts of cells, shape (K, *_PARTS, rows): on rough ones, and on fine ones where it is much."""
+    found = asked(_ROUGH).reshape(-1, *_ROUGH, rows)
+    much = found[0].max() > _WORTH
+    found = np.repeat(np.repeat(found, _PARTS[0] // _ROUGH[0], axis=1), _PARTS[1] // _ROUGH[1], axis=2)
+    return np.asarray(pick(found, asked(_PARTS).reshape(found.shape))) if much else found
 
 
 def _on_parts(
@@ -238,7 +242,7 @@ def tolls_of(
     bent = bent / 8 * (1 + 1e-9) + 1e-14
     bent = bent + over_corners(np.maximum, frame.radius[1]) + 1e-13 * over_corners(np.maximum, np.abs(frame.image[1]))
     above = _UP_TO * setting.noise * math.sqrt(clock.step)
-    spread = tuple(np.repeat(np.arange(len(part) - 1), np.diff(part)) for part in starts)
+    spread_y, spread_q = (np.repeat(np.arange(len(part) - 1), np.diff(part)) for part in starts)
     for ways in (ways for ways in every if ways):
         total = np.zeros((1 + len(above), *_PARTS, *frame.live.shape))
         side = np.zeros(ways[0].paid.shape, dtype=int)
@@ -247,28 +251,27 @@ def tolls_of(
             if not len(rows):
                 continue
             more = float(blocks.strays.most[1][i, j]) + bent[rows, columns]
-            options = []
-            for way in (way for way in ways if way.paid[i, j]):
-                due = _refined(lambda parts: _passed_from(
-                    setting, clock, frame, way, (rows, columns), (int(i), int(j)), above, parts, more,
-                    blocks.covariance[2][i, j],
-                ), len(rows))  # fmt: skip
-                options.append((float(due.sum()), int(way.found.sign > 0), due))
-            side[i, j], due = min(options)[1:]
+            middle, open_ways = blocks.strays.tube[1].mid[i, j], [way for way in ways if way.paid[i, j]]
+            way = max(open_ways, key=lambda way: way.found.sign * (middle - way.found.end))  # any will do
+            asked = partial(
+                _passed_from, setting, clock, frame, way, int(way.place[i, j]), (rows, columns), above, more,
+                blocks.covariance[2][i, j],
+            )  # fmt: skip
+            side[i, j], due = int(way.found.sign > 0), _refined(asked, np.minimum, len(rows))
             total[..., rows, columns] = due
         nodal, lacks = (np.stack(part) for part in zip(*(_shared(part) for part in total)))
         found.append(Toll(
-            nodal=nodal, lacks=lacks, rows=_landing(clock, frame, blocks, ways, above), side=side, spread=spread,
-            columns=_beside(frame, ways, above),
+            nodal=nodal, lacks=lacks, rows=_landing(clock, frame, blocks, ways, above), side=side,
+            spread=(spread_y, spread_q), columns=_beside(frame, ways, above),
         ))  # fmt: skip
     return found
 
 
 def _passed_from(
-    setting: Setting, clock: Clock, frame: Frame, way: Way, cells: tuple[Index, Index], block: tuple[int, int],
-    above: Array, parts: tuple[int, int], more: Array, variance: Interval,
+    setting: Setting, clock: Clock, frame: Frame, way: Way, k: int, cells: tuple[Index, Index], above: Array,
+    more: Array, variance: Interval, parts: tuple[int, int],
 ) -> Array:  # fmt: skip
-    """`passed` on parts of cells of a block, shape (1 + K, parts times cells); ``more``: what images are off by."""
+    """`passed` on parts of cells of the ``k``-th block, shape (1 + K, parts times cells); ``more``: of the images."""
     p, q, rates = _on_parts(setting, clock, frame, *cells, parts)
     ends = np.stack([
         np.concatenate([_between(frame.image[1], *cells, part, parts, side) for part in np.ndindex(*parts)])
@@ -277,13 +280,13 @@ def _passed_from(
     most = np.tile(more, math.prod(parts))
     image = Interval(ends.min(axis=0) - most, ends.max(axis=0) + most)
     away = np.nextafter(p.lo - way.ends[1], -np.inf), np.nextafter(way.ends[0] - p.hi, -np.inf)
-    sign, end, k = way.found.sign, way.found.end, int(way.place[block])
+    sign, end = way.found.sign, way.found.end
     due = np.ones((1 + len(above), len(p)))
-    for found in (way.found, way.close):
-        if found.known[k]:
+    for found in (way.found, way.close) if parts == _ROUGH or not way.close.known[k] else (way.close,):
+        if found.known[k] and due[0].max() > _LITTLE:
             due = np.minimum(due, passed(
-                found, k, (q - end) * sign, _drift(setting, found, p), away, rates, (image - end) * sign, variance, above,
-                setting.noise * (1 + setting.spread), clock.step,
+                found, k, (q - end) * sign, _drift(setting, found, p), away, rates, (image - end) * sign, variance,
+                above, setting.noise * (1 + setting.spread), clock.step,
             ))  # fmt: skip
     return due
 
@@ -302,9 +305,9 @@ def _beside(frame: Frame, ways: list[Way], above: Array) -> Mask:
     """Cells of q up to the heights beyond the lower and the upper end of an obstacle, shape (2, K, nq - 1)."""
     found = np.zeros((2, len(above), len(frame.q) - 1), dtype=bool)
     for way in ways:
-        low, high = (np.minimum, np.maximum)
-        ends = [(part - way.found.end) * way.found.sign for part in (frame.q[:-1], frame.q[1:])]
-        found[int(way.found.sign > 0)] = (low(*ends) <= above[:, None]) & (high(*ends) > 0)
+        heights = (frame.q - way.found.end) * way.found.sign
+        low, high = np.minimum(heights[:-1], heights[1:]), np.maximum(heights[:-1], heights[1:])
+        found[int(way.found.sign > 0)] = (low <= above[:, None] * (1 + 1e-9)) & (high > 0)
     return found
 
 
@@ -327,5 +330,6 @@ def _shared(due: Array) -> tuple[Array, Array]:
     rows, columns = np.nonzero(due.any(axis=(0, 1)))
     for part in np.ndindex(*_PARTS):
         least = np.min([_between(nodal, rows, columns, part, _PARTS, side) for side in _SIDES], axis=0)
-        lacks[rows, columns] = np.maximum(lacks[rows, columns], due[(*part, rows, columns)] - least + 1e-12 * np.abs(least))
+        missing = due[(*part, rows, columns)] - least + 1e-12 * np.abs(least)
+        lacks[rows, columns] = np.maximum(lacks[rows, columns], missing)
     return nodal, lacks
