@@ -11,13 +11,13 @@ and P(meets it, ends outside, not with 0 < Z_h <= z) <= P(Z <= 0 at some time in
 Each holds on the event of `remainders`; what is taken off may be too much by its share, for which `leaving._RARE` has
 room. Narrower tubes give sharper bounds, and their rareness is added.
 
-*Z* (`motion_of`): on the tube Z' is the drift at the end less pull Z, but for rest. The drift at the end is that for the
-start's p, and changes at a rate within ``turn``; where F has one sign and dF = c dt + a s dW, also at most at the mean of
-F up to then, within F_0 + c u/2 +- |a| s sup |W|, times what p changes it by. ``reflections`` bounds the rest.
+*Z* (`motion_of`): on the tube Z' is the drift at the end less pull Z, but for rest. The drift at the end is that for
+the start's p, and changes at a rate within ``turn``; where F has one sign and dF = c dt + a s dW, also on average at
+the mean of F up to then, within F_0 + c u/2 +- |a| s sup |W|, times what p changes it by. See ``reflections``.
 
 *The time t* (`arrival_of`): |F| bounds it. Where F <= 0 all along and F_q is a constant a, dF >= c dt + a s dW, so that
-p_u >= p_0 + F_0 u + c u^2/2 + a s int W, and int W up to u is normal with variance u^3/3. As p only falls, p_t > p1 tells
-that p was above p1 before, and given the noise M_t of Z, with xi deviations, int W is normal with mean
+p_u >= p_0 + F_0 u + c u^2/2 + a s int W, and int W up to u is normal with variance u^3/3. As p only falls, p_t > p1
+tells that p was above p1 before; and given the noise M_t of Z, with xi deviations, int W is normal with the mean
 xi int (t - v) e^{pull v} dv / sqrt(int e^{2 pull v} dv) (with a sign): who is early counts, given xi. All t are valid,
 and the least bound of a few is taken; P(Z_h <= 0) is taken off where t < h only.
 
@@ -197,7 +197,7 @@ def passed(
 def motion_of(
     found: Passing, k: int, heights: Interval, drift: Interval, rates: Interval, s: float, step: float
 ) -> Motion:
-    """Z on the tubes of a box of starts; of parts of it ``heights``, ``drift`` (at the obstacle's end), ``rates`` (F)."""
+    """Z on the tubes of a box of starts; of its parts ``heights``, ``drift`` at the obstacle's end, ``rates`` (F)."""
     rest, low, high = float(found.rest[k]), found.turn.lo[k], found.turn.hi[k]
     if math.isfinite(found.bend.lo[k]):  # the mean of F up to u, up to a noise of at most F_q s sup |W|
         noise = float(found.slope[k]) * s * found.omega * math.sqrt(step) * _UP

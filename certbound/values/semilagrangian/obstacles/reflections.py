@@ -188,12 +188,12 @@ def _density(z: float) -> float:
 @compiled
 def _early(low: float, gap: float, lean: float, loose: float) -> float:
     """P(xi > low, xi lean + N(0, loose^2) <= -gap), from above."""
-    top = max(low, 0.0) + 9.0
+    top = max(low, 0.0) + _FAR
     before, chance = _below(-low), _below(-(gap + lean * low) / loose)
-    total = _below(-top)
-    pieces = 6 * _FEW
+    total = _below(-top) * (_below(-(gap + lean * top) / loose) if lean >= 0.0 else 1.0) * (1 + 1e-8)
+    pieces = 12 * _FEW
     for i in range(1, pieces + 1):
-        place = low + (top - low) * i / pieces
+        place = low + (top - low) * (i / pieces) ** 2
         now, mass = _below(-(gap + lean * place) / loose), _below(-place)
         total += max(before * (1 + _SURE) - mass * (1 - _SURE), 0.0) * max(chance, now) * (1 + 1e-8)
         before, chance = mass, now

@@ -62,9 +62,9 @@ class Toll:
     """What is paid for paths that meet an obstacle within a step and end beside it.
 
     ``nodal``, shape (1 + K, ny, nq), bilinear in between, and ``lacks``, shape (1 + K, ny - 1, nq - 1), on cells: who
-    does, and who does and does not end up to K heights beyond its end. ``rows``, shape (2, *blocks): first and last
-    (excluded) cell of y in which they end, ``columns``, shape (2, K, nq - 1), which cells of q those heights touch, by
-    end; ``side``, shape blocks: which end; ``spread``: the blocks of cells of y and q.
+    does, and who does and does not end up to K heights beyond its end. By end, ``rows``, shape (2, 2, *blocks): first
+    and last (excluded) cell of y in which they end, ``columns``, shape (2, K, nq - 1): which cells of q those heights
+    touch; ``side``, shape blocks: which end; ``spread``: the blocks of cells of y and q.
     """
 
     nodal: Array
@@ -85,7 +85,7 @@ class Toll:
             for k, columns in enumerate(self.columns[side]):
                 if here.any() and columns.any():
                     lowest = np.append(least[:, columns].min(axis=1), np.inf)
-                    found = np.minimum.reduceat(lowest, self.rows[:, here].T.ravel())[::2]
+                    found = np.minimum.reduceat(lowest, self.rows[side][:, here].T.ravel())[::2]
                     shares[1 + k, here] = np.minimum(np.clip(found, 0.0, 1.0), shares[k, here])
         shares = ((shares[:-1] - shares[1:]) * (1 + 1e-9))[:, self.spread[0][:, None], self.spread[1]]
         paid = np.zeros(nodal.shape)
@@ -136,33 +136,43 @@ def _caught_from(
 def catches_of(
     setting: Setting, clock: Clock, frame: Frame, blocks: Blocks, starts: tuple[Index, Index], every: list[list[Way]]
 ) -> list[Catch]:
-    """What cells are paid from below, end by end of the first obstacle with any; as `tolls_of`."""
-    (p_tube, q_tube) = blocks.strays.tube
-    above, faces, catches = _ABOVE * setting.noise * math.sqrt(clock.step), setting.faces[1], []
-    y, q = Interval(frame.y[:-1], frame.y[1:]), Interval(frame.q[:-1], frame.q[1:])
-    for way in (way for ways in every for way in ways):
+    """What cells are paid from below, end by end of the one obstacle that pays most; as `tolls_of`."""
+    (p_tube, q_tube), faces = blocks.strays.tube, setting.faces[1]
+    above, found = _ABOVE * setting.noise * math.sqrt(clock.step), []
+    sizes = np.zeros((len(every), *frame.live.shape))
+    for number, way in ((number, way) for number, ways in enumerate(every) for way in ways):
         kept = way.paid & (q_tube.lo > faces[0]) & (q_tube.hi < faces[1])
         kept[kept] = way.close.stays[way.place[kept]]
         if not kept.any():
             continue
-        less = np.zeros((len(above), *_PARTS, *frame.live.shape))
-        for i, j in np.argwhere(kept):
-            rows, columns = _cells(frame, starts, i, j)
-            if not len(rows):
-                continue
-            asked = partial(_caught_from, setting, clock, frame, way, int(way.place[i, j]), (rows, columns), above)
-            less[..., rows, columns] = -_refined(asked, np.maximum, len(rows))
         tall = float(q_tube.lo[kept].min()), float(q_tube.hi[kept].max())
         ends = max(float(p_tube.lo[kept].min()), way.ends[0]), min(float(p_tube.hi[kept].max()), way.ends[1])
         slant = sorted((clock.shear * tall[0], clock.shear * tall[1]))
         if frame.y[0] + slant[1] > ends[0] or frame.y[-1] + slant[0] < ends[1]:
             continue
-        p = y[:, None] + (q * clock.shear)[None]
-        high = ((q - way.found.end) * way.found.sign).hi
-        near = (p.hi >= ends[0]) & (p.lo <= ends[1]) & (q.hi >= tall[0]) & (q.lo <= tall[1])
-        nodal, lacks = (np.stack(part) for part in zip(*(_shared(part) for part in less)))
-        catches.append(Catch(nodal=-nodal, lacks=lacks, places=near & (high >= above[:, None])[:, None]))
+        less = np.zeros((len(above), *_PARTS, *frame.live.shape))
+        for i, j in np.argwhere(kept):
+            rows, columns = _cells(frame, starts, i, j)
+            if len(rows):
+                asked = partial(_caught_from, setting, clock, frame, way, int(way.place[i, j]), (rows, columns), above)
+                less[..., rows, columns] = -_refined(asked, np.maximum, len(rows))
+        sizes[number] -= less[0].mean(axis=(0, 1))
+        found.append((number, less, _places(clock, frame, way, ends, tall, above)))
+    catches = []
+    for number, less, places in found:
+        part = np.where(sizes.argmax(axis=0) == number, less, 0.0)
+        nodal, lacks = (np.stack(tables) for tables in zip(*map(_shared, part)))
+        catches.append(Catch(nodal=-nodal, lacks=lacks, places=places))
     return catches
+
+
+def _places(clock: Clock, frame: Frame, way: Way, ends: Ends, tall: Ends, above: Array) -> Mask:
+    """Cells with p and q between these ends that reach higher than ``above``, shape (K, ny - 1, nq - 1)."""
+    y, q = Interval(frame.y[:-1], frame.y[1:]), Interval(frame.q[:-1], frame.q[1:])
+    p = y[:, None] + (q * clock.shear)[None]
+    near = (p.hi >= ends[0]) & (p.lo <= ends[1]) & (q.hi >= tall[0]) & (q.lo <= tall[1])
+    high = ((q - way.found.end) * way.found.sign).hi
+    return np.asarray(near & (high >= above[:, None])[:, None])
 
 
 def _cells(frame: Frame, starts: tuple[Index, Index], i: int, j: int) -> tuple[Index, Index]:
@@ -292,13 +302,18 @@ def _passed_from(
 
 
 def _landing(clock: Clock, frame: Frame, blocks: Blocks, ways: list[Way], above: Array) -> Index:
-    """First and last (excluded) cells of y in which who has met an obstacle may end beside it, shape (2, blocks)."""
-    p, ends = blocks.strays.tube[0], ways[0].ends
-    tall = [way.found.end + way.found.sign * part for way in ways for part in (0.0, float(above[-1]))]
-    slant = sorted(clock.shear * q for q in tall)
-    low, high = np.maximum(p.lo, ends[0]) - slant[-1] - 1e-9, np.minimum(p.hi, ends[1]) - slant[0] + 1e-9
-    first = np.clip(np.searchsorted(frame.y, low, side="right") - 1, 0, len(frame.y) - 2)
-    return np.stack([first, np.clip(np.searchsorted(frame.y, high), first + 1, len(frame.y) - 1)])
+    """First and last (excluded) cells of y in which who has met an obstacle may end, shape (2 ends, 2, *blocks)."""
+    p, found = blocks.strays.tube[0], np.zeros((2, 2, *blocks.known.shape), dtype=int)
+    for way in ways:
+        tall = way.found.end, way.found.end + way.found.sign * 1.001 * float(above[-1])
+        slant = sorted(clock.shear * end for end in tall)
+        low, high = (
+            np.maximum(p.lo, way.ends[0]) - slant[1] - 1e-9, np.minimum(p.hi, way.ends[1]) - slant[0] + 1e-9
+        )  # fmt: skip
+        first = np.clip(np.searchsorted(frame.y, low, side="right") - 1, 0, len(frame.y) - 2)
+        last = np.clip(np.searchsorted(frame.y, high), first + 1, len(frame.y) - 1)
+        found[int(way.found.sign > 0)] = first, last
+    return found
 
 
 def _beside(frame: Frame, ways: list[Way], above: Array) -> Mask:
