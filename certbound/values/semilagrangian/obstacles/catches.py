@@ -22,7 +22,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.semilagrangian.obstacles.passings import Passing, arrival_of, at_most, motion_of
 from certbound.values.semilagrangian.obstacles.reflections import dipped
 
-_WIDE = (0.5, 1.2, 2.0, 3.0, math.inf)
+_WIDE = (0.5, 1.2, 2.0, math.inf)
 
 
 def caught(

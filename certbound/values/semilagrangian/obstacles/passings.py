@@ -39,7 +39,7 @@ from certbound.values.semilagrangian.confines import Ends
 from certbound.values.semilagrangian.obstacles.reflections import Arrival, Motion, dipped, grown
 
 _UP = 1 + 1e-9
-_WIDE = (1.0, 1.7, 2.6, 3.8, math.inf)
+_WIDE = (1.0, 1.7, 2.6, math.inf)
 _FIRST = 2  # from which of them on wide tubes are asked, with which nothing is paid
 _LITTLE = 1e-3  # of which it does not matter where it ends
 

@@ -32,7 +32,7 @@ from certbound.arrays import Array, Mask
 from certbound.lazy import compiled
 from certbound.rigor.intervals import Interval
 
-_PIECES, _FEW, _RARELY = 10, 3, 1e-5  # pieces, and how many where hardly any path is
+_PIECES, _FEW, _RARELY = 8, 3, 1e-5  # pieces, and how many where hardly any path is
 _FAR = 6.0
 _SURE = 1e-10  # relative, for every erfc and product
 

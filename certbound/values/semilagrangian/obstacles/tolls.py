@@ -49,7 +49,7 @@ class Way:
     paid: Mask
 
 
-_PARTS, _ROUGH = (8, 2), (2, 1)  # of a cell, along y and q, of which is asked, and where little is found
+_PARTS, _ROUGH = (6, 2), (2, 1)  # of a cell, along y and q, of which is asked, and where little is found
 _WORTH, _LITTLE = 0.01, 1e-4
 _SIDES = ((0, 0), (0, 1), (1, 0), (1, 1))
 _CLOSE = 4.2  # omega of narrower tubes, whose rareness is paid where they are used
