@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,8 +14,10 @@ from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, through
 from certbound.values.semilagrangian.confines import TWICE
 from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import Setting
-from certbound.values.semilagrangian.obstacles import Catch
+from certbound.values.semilagrangian.obstacles import Catch, Toll
 from certbound.values.semilagrangian.smoothing import Lines
+
+_SLICES = 16  # of a column of cells, over which starts are gone through: a ball is a box over each
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -38,8 +41,8 @@ class Bounds:
         Whether this is about -L.
     paid : ndarray, shape (ny - 1, nq - 1), or 0
         What every cell pays besides in a step.
-    nodal : ndarray, shape (ny, nq), or 0
-        What is paid besides at nodes, and bilinear in between.
+    tolls : sequence of Toll
+        What is paid for obstacles.
     catches : sequence of Catch
         What cells are paid (-L).
     """
@@ -51,7 +54,7 @@ class Bounds:
     mirrors: Sequence[Mirror] = ()
     below: bool = False
     paid: Array | float = 0.0
-    nodal: Array | float = 0.0
+    tolls: Sequence[Toll] = ()
     catches: Sequence[Catch] = ()
 
 
@@ -72,10 +75,14 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
         payment[band.first : band.last] = paid
     bend = np.where(np.isfinite(bend), bend, 0.0)
     payment = payment + bounds.paid
-    owed = [catch.owed(value.nodal, value.bend, np.diff(frame.q)) for catch in bounds.catches]
-    if owed:
-        payment = payment - np.maximum.reduce(owed)
-    return limited(frame, bounds, nodal + bounds.nodal + around_nodes(payment, largest=True), bend)
+    dq = np.diff(frame.q)
+    for catch in bounds.catches:
+        less, lacks = catch.owed(value.nodal, value.bend, dq)
+        nodal, payment = nodal - less, payment + lacks
+    for toll in bounds.tolls:
+        more, lacks = toll.due(value.nodal, value.bend, dq)
+        nodal, payment = nodal + more, payment + lacks
+    return limited(frame, bounds, nodal + around_nodes(payment, largest=True), bend)
 
 
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:
@@ -126,14 +133,15 @@ def highest(frame: Frame, value: Lines, setting: Setting, shear: float) -> float
     first = max(int(np.searchsorted(frame.q, low, side="right")) - 1, 0)
     last = min(int(np.searchsorted(frame.q, high)), len(frame.q) - 1)
     for j in range(first, max(last, first + 1)):
-        q = max(low, frame.q[j]), min(high, frame.q[j + 1])
-        p = setting.starts_between(*q)
-        ends = sorted((shear * q[0], shear * q[1]))
-        slack = 1e-14 * (1 + abs(p[0]) + abs(p[1]))
-        y = (p[0] - ends[1] - slack, p[1] - ends[0] + slack)
-        if y[0] < frame.y[0] or y[1] > frame.y[-1]:
-            return 1.0
-        best = max(best, _over_strip(frame, value, j, q, y))
+        ends = np.linspace(max(low, frame.q[j]), min(high, frame.q[j + 1]), _SLICES + 1)
+        for q in itertools.pairwise(ends.tolist()):
+            p = setting.starts_between(*q)
+            away = sorted((shear * q[0], shear * q[1]))
+            slack = 1e-14 * (1 + abs(p[0]) + abs(p[1]))
+            y = (p[0] - away[1] - slack, p[1] - away[0] + slack)
+            if y[0] < frame.y[0] or y[1] > frame.y[-1]:
+                return 1.0
+            best = max(best, _over_strip(frame, value, j, q, y))
     return best
 
 

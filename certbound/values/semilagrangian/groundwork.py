@@ -118,12 +118,11 @@ def _prepared(
     level = np.maximum(levels_above(marked.safe & live, marked.crossed), beyond)
     everywhere = np.ones(level.shape, dtype=bool)
     known = setting, clock, frame, blocks, (_starts(index[0]), _starts(index[1])), marked.ways
-    nodal, paid = tolls_of(*known)
     layout = Layout(
         clock=clock, frame=frame, bands=bands,
         above=Bounds(
-            level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above, paid=marked.bent + paid,
-            nodal=nodal,
+            level=level, fixed=level > 0, free=everywhere, reach=reach, mirrors=above, paid=marked.bent,
+            tolls=tolls_of(*known),
         ),
         below=bounds_below(live, marked.broken, reach, below, catches_of(*known)),
     )  # fmt: skip

@@ -4,6 +4,6 @@ From the bottom: ``passings`` (how probable that is from a box of starts), ``cat
 least), ``tolls`` (what the grid's cells pay, and are paid from below).
 """
 
-from certbound.values.semilagrangian.obstacles.tolls import Catch, Way, catches_of, tolls_of, ways_past
+from certbound.values.semilagrangian.obstacles.tolls import Catch, Toll, Way, catches_of, tolls_of, ways_past
 
-__all__ = ["Catch", "Way", "catches_of", "tolls_of", "ways_past"]
+__all__ = ["Catch", "Toll", "Way", "catches_of", "tolls_of", "ways_past"]

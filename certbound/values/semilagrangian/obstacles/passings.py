@@ -7,22 +7,19 @@ obstacle, and let p not be in [p0, p1] before the time t. A path that meets the 
 
     P(meets it, ends outside) <= P(Z <= 0 at some time in [t, h]) - P(Z_h <= 0) + P(Z_h < -depth).
 
+and P(meets it, ends outside, not with 0 < Z_h <= z) <= P(Z <= 0 at some time in [t, h], Z_h > z) + P(Z_h < -depth).
 Each holds on the event of `remainders`; what is taken off may be too much by its share, for which `leaving._RARE` has
-room.
+room. Narrower tubes give sharper bounds, and their rareness is added.
 
-*The first*: Z is at least the solution Y of dY = (push - pull Y) dt + s dW, Y_0 the least Z of the starts, since Z' is
-at least that on the tube. Y_t is normal. From y > 0 on, Y meets 0 with a probability of at most c(y) (`meeting`), which
-falls: its mean is at most the sum of c's falls at y_1 < y_2 < ... times P(Y_t < y_i), with c = 1 up to 0. Only h - t is
-left to do so: c is that of the next larger one of h, h/sqrt(2), h/2, ...
+*Z* (`motion_of`): on the tube Z' is the drift at the end less pull Z, but for rest. The drift at the end is that for
+the start's p, and changes at a rate within ``turn``; where F has one sign and dF = c dt + a s dW, also on average at
+the mean of F up to then, within F_0 + c u/2 +- |a| s sup |W|, times what p changes it by. See ``reflections``.
 
-The drift at the end is that for the start's p, and changes at a rate within ``turn``: where that gives a larger mean of
-Y, it is taken (`least_mean`).
-
-*The time t* (`_arrival`): |F| bounds it. Where F <= 0 all along and F_q is a constant a, dF >= c dt + a s dW, so that
-p_u >= p_0 + F_0 u + c u^2/2 - |a| s |int W|, and int W up to u is normal with variance u^3/3. As p only falls, p_t > p1
-tells that p was above p1 before: true but for a share Phi(-w) of the paths, if t is the first root of
-away - (r - F_0) t + c t^2/2 with r = |a| s w sqrt(u/3) for a u >= t. The share is added; P(Z_h <= 0) is taken off where
-t <= h only. All w are valid, and the least bound is taken.
+*The time t* (`arrival_of`): |F| bounds it. Where F <= 0 all along and F_q is a constant a, dF >= c dt + a s dW, so that
+p_u >= p_0 + F_0 u + c u^2/2 + a s int W, and int W up to u is normal with variance u^3/3. As p only falls, p_t > p1
+tells that p was above p1 before; and given the noise M_t of Z, with xi deviations, int W is normal with the mean
+xi int (t - v) e^{pull v} dv / sqrt(int e^{2 pull v} dv) (with a sign): who is early counts, given xi. All t are valid,
+and the least bound of a few is taken; P(Z_h <= 0) is taken off where t < h only.
 
 *The others*: Z_h is the end of the flow plus a normal law plus the remainder (``remainders``).
 """
@@ -35,17 +32,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.lazy import compiled
 from certbound.problem.model import Tape, jacobian
 from certbound.rigor.intervals import Interval
 from certbound.values.discrete import evaluate
 from certbound.values.semilagrangian.confines import Ends
+from certbound.values.semilagrangian.obstacles.reflections import Arrival, Motion, dipped, grown
 
 _UP = 1 + 1e-9
-_FALLS = np.concatenate([0.95 ** np.arange(1, 64), 0.035 * 0.7 ** np.arange(1, 40), 2e-8 * 0.3 ** np.arange(1, 50)])
-_PIECES = 800
-_WIDE = (2.5, 3.0, 3.8, 6.0, math.inf)
-_GRADES = 12
+_WIDE = (1.0, 1.7, 2.6, math.inf)
+_FIRST = 2  # from which of them on wide tubes are asked, with which nothing is paid
+_LITTLE = 1e-3  # of which it does not matter where it ends
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -56,22 +52,21 @@ class Passing:
     ----------
     sign, end, depth : float
         Z = sign (q - end), between -depth and 0 in the obstacle.
-    push, pull : ndarray
-        Z' >= push - pull Z.
-    rest : ndarray
+    omega : float
+        sup |W| is at most that times the root of the step on the tubes.
+    pull, rest : ndarray
         Z' is the drift at the end less pull Z, but for so much.
-    turn : Interval
-        How fast the drift of q at the end changes, along Z.
-    top : ndarray
-        Z <= top.
+    turn, along, bend : Interval
+        How fast the drift of q at the end changes, along Z, and how it does with p; the drift of F, where F_q is
+        constant and F has one sign.
     speeds : (ndarray, ndarray)
         How fast p falls and rises at most.
     turns : (ndarray, ndarray)
         c of the module where p only falls, and where it only rises; nan where that does not serve.
     slow, slowed : (ndarray, ndarray)
         For lower bounds: how fast p falls and rises at least, and what is at least c there.
-    slope : ndarray
-        |F_q|.
+    slope, tilt : ndarray
+        |F_q|, and F_q where it is constant.
     stays, known : ndarray of bool
         Whether p stays between the obstacle's ends once it is there; whether all this was shown.
     """
@@ -79,22 +74,25 @@ class Passing:
     sign: float
     end: float
     depth: float
-    push: Array
+    omega: float
     pull: Array
     rest: Array
     turn: Interval
-    top: Array
+    along: Interval
+    bend: Interval
     speeds: tuple[Array, Array]
     turns: tuple[Array, Array]
     slow: tuple[Array, Array]
     slowed: tuple[Array, Array]
     slope: Array
+    tilt: Array
     stays: Mask
     known: Mask
 
 
 def passing(
-    ends: tuple[Ends, Ends], tape: Tape, tube: tuple[Interval, Interval], start: Interval, even: Mask, side: int
+    ends: tuple[Ends, Ends], tape: Tape, tube: tuple[Interval, Interval], start: Interval, even: Mask, side: int,
+    omega: float,
 ) -> Passing:
     """How paths pass the lower or upper end along q of an obstacle.
 
@@ -111,6 +109,8 @@ def passing(
     even : ndarray of bool, shape (N,)
         Where F_q is known to be constant.
     side : int
+    omega : float
+        Of the tube.
     """
     (p0, p1), (q0, q1) = ends
     p, q = tube
@@ -126,12 +126,15 @@ def passing(
     known = ~bad & ~worse & ~worst & ~jumps & np.isfinite(np.hstack([f.mag, at.mag, slopes.mag])).all(axis=1)
     reach = np.maximum(np.abs(q.lo - end), np.abs(q.hi - end))
     rest = slopes[:, 3].rad * reach * _UP
-    push, turn = (at[:, 1] * sign).lo - rest, slopes[:, 2] * f[:, 0] * sign
+    single = even & known & (falls | rises)
+    along = slopes[:, 2] * sign
+    turn = along * f[:, 0]
     return Passing(
-        sign=sign, end=end, depth=q1 - q0, push=np.where(known, push - 1e-12 * (1 + np.abs(push)), 0.0),
+        sign=sign, end=end, depth=q1 - q0, omega=omega,
         pull=np.where(known, -slopes[:, 3].mid, 0.0), rest=np.where(known, rest, 0.0),
         turn=Interval(np.where(known, turn.lo, 0.0), np.where(known, turn.hi, 0.0)),
-        top=np.where(known, (q.hi - end if side else end - q.lo) * _UP, 1.0),
+        along=Interval(np.where(known, along.lo, 0.0), np.where(known, along.hi, 0.0)),
+        bend=Interval(np.where(single, drift.lo, -np.inf), np.where(single, drift.hi, np.inf)),
         speeds=(np.maximum(-f.lo[:, 0], 0.0) * _UP, np.maximum(f.hi[:, 0], 0.0) * _UP),
         turns=(
             np.where(even & known & falls, drift.lo, np.nan), np.where(even & known & rises, -drift.hi, np.nan)
@@ -140,25 +143,26 @@ def passing(
         slowed=(
             np.where(even & known & falls, drift.hi, np.nan), np.where(even & known & rises, -drift.lo, np.nan)
         ),
-        slope=slopes[:, 1].mag, stays=((p.lo >= p0) | rises) & ((p.hi <= p1) | falls) & known, known=known,
+        slope=slopes[:, 1].mag, tilt=slopes[:, 1].mid, known=known,
+        stays=((p.lo >= p0) | rises) & ((p.hi <= p1) | falls) & known,
     )  # fmt: skip
 
 
 def passed(
-    found: Passing, k: int, low: Array, drift: Array, away: tuple[Array, Array], rates: Interval, ends: Interval,
-    variance: Interval, s: float, step: float,
+    found: Passing, k: int, heights: Interval, drift: Interval, away: tuple[Array, Array], rates: Interval,
+    ends: Interval, variance: Interval, above: Array, s: float, step: float,
 ) -> Array:  # fmt: skip
     """Upper bounds of the probability that a path meets the obstacle within the step and ends outside of it.
+
+    The first of all, then not with 0 < Z <= ``above``; shape (1 + K, N).
 
     Parameters
     ----------
     found : Passing
     k : int
         The box of starts.
-    low : ndarray, shape (N,)
-        The least Z of the starts.
-    drift : ndarray, shape (N,)
-        Least drift of Z at the end of the obstacle, for p of the starts.
+    heights, drift : Interval, shape (N,)
+        Z of the starts, and its drift at the end of the obstacle for their p.
     away : two ndarrays, shape (N,)
         Least distances of p from the obstacle where it is above its upper (below its lower) end, else at most 0.
     rates : Interval, shape (N,)
@@ -167,107 +171,96 @@ def passed(
         Z of the noise-free flow's ends, with the remainder.
     variance : Interval
         Of Z at the step's end.
+    above : ndarray, shape (K,)
     s, step : float
     """
-    push, pull = float(found.push[k]), float(found.pull[k])
-    best: Array = np.ones(len(low))
-    tables: dict[int, tuple[Array, Array]] = {}
-    within = beyond = np.zeros(len(low))
+    motion = motion_of(found, k, heights, drift, rates, s, step)
+    within = beyond = np.zeros(len(rates))
     if found.stays[k]:
         within, beyond = -ends.hi, -(found.depth + ends.lo)
         within = at_most(within / np.sqrt(np.where(within < 0, variance.lo, variance.hi))) * (1 - 4e-9)
         beyond = at_most(beyond / np.sqrt(np.where(beyond > 0, variance.lo, variance.hi)))
-    for wide in _WIDE if np.isfinite([turn[k] for turn in found.turns]).any() else _WIDE[-1:]:
-        late = _arrival(found, k, away, rates, s, step, wide)
-        t = np.minimum(late, step)
-        mean = np.maximum(low * np.exp(-pull * t) + push * whole(pull, t), least_mean(found, k, low, drift, t))
-        mean -= 1e-12 * (np.abs(low) + abs(push) * step)
-        root = np.maximum(s * np.sqrt(whole(2 * pull, t)), 1e-300)
-        met, left = np.zeros(len(low)), step / np.maximum(step - t, 1e-300)
-        grade = np.minimum(np.floor(2 * np.log2(left)), _GRADES).astype(int)
-        for j in np.unique(grade[late <= step]).tolist():
-            if j not in tables:
-                tables[j] = meeting(push, pull, float(found.top[k]), s, step * 2 ** (-j / 2) * _UP)
-            here = np.flatnonzero(grade == j)
-            met[here] = _mean_of(*tables[j], mean[here], root[here]) * _UP
-        met = np.where(late > step, 0.0, np.maximum(met - within, 0.0) + beyond)
-        best = np.minimum(best, met + float(at_most(np.array(-wide))))
-    return best
+    best, chosen = np.full(len(rates), np.inf), None
+    options = _WIDE[_FIRST:] if found.omega > 6 else _WIDE[:-1]
+    for wide in options if np.isfinite([turn[k] for turn in found.turns]).any() else _WIDE[-1:]:
+        arrival = arrival_of(found, k, away, rates, s, step, wide, upper=True)
+        met, late = dipped(motion, arrival, np.array([-math.inf]), upper=True)[0], arrival.t >= step
+        met = np.where(late, met, np.maximum(met - within, 0.0) + beyond)
+        chosen = arrival if chosen is None else chosen.where(best <= met, arrival)
+        best = np.minimum(best, met)
+    higher = np.broadcast_to(best, (len(above), len(best)))
+    if found.stays[k] and chosen is not None and best.max() > _LITTLE:
+        higher = np.minimum(best, dipped(motion, chosen, above, upper=True) + beyond)
+    return np.minimum(np.vstack([best, higher]) + 4 * float(at_most(np.array(-found.omega))), 1.0)
 
 
-@compiled
-def _mean_of(y: Array, chance: Array, mean: Array, root: Array) -> Array:
-    """The mean of the step function that falls from 1 to ``chance`` at ``y`` (and never below the last of them)."""
-    found = np.empty(len(mean))
-    for n in range(len(mean)):
-        total, before = 0.0, 1.0
-        for i in range(len(y)):
-            z = (y[i] - mean[n]) / root[n]
-            if z > 9.0:
-                total += before
-                before = 0.0
-                break
-            if z > -38.0:
-                total += (before - chance[i]) * 0.5 * math.erfc(-z / math.sqrt(2.0))
-            before = chance[i]
-        found[n] = (total + before) * (1 + 1e-9) + 1e-300
-    return found
+def motion_of(
+    found: Passing, k: int, heights: Interval, drift: Interval, rates: Interval, s: float, step: float
+) -> Motion:
+    """Z on the tubes of a box of starts; of its parts ``heights``, ``drift`` at the obstacle's end, ``rates`` (F)."""
+    rest, low, high = float(found.rest[k]), found.turn.lo[k], found.turn.hi[k]
+    if math.isfinite(found.bend.lo[k]):  # the mean of F up to u, up to a noise of at most F_q s sup |W|
+        noise = float(found.slope[k]) * s * found.omega * math.sqrt(step) * _UP
+        mean = rates + found.bend[k] * Interval(0.0, step / 2) + Interval(-noise, noise)
+        own = mean * found.along[k]
+        low, high = np.fmax(low, own.lo), np.fmin(high, own.hi)
+    return Motion(
+        start=heights, drift=Interval(drift.lo - rest, drift.hi + rest), pull=float(found.pull[k]), s=s, step=step,
+        rate=Interval(np.minimum(low, high), high) + np.zeros(len(rates)),
+    )  # fmt: skip
 
 
-def least_mean(found: Passing, k: int, low: Array, drift: Array, t: Array) -> Array:
-    """Lower bounds of E Y_t for dY = (drift - rest + turn u - pull Y) du + s dW from ``low`` on."""
-    pull, rate = float(found.pull[k]), float(found.turn.lo[k])
-    shares = np.exp(-pull * t), np.ones(np.shape(t))  # int u e^{-pull (t - u)} lies between both times t^2/2
-    change = np.minimum(rate * shares[0], rate * shares[1]) * t**2 / 2
-    mean = low * shares[0] + (drift - float(found.rest[k])) * whole(pull, t) + change
-    return np.asarray(mean - 1e-12 * (np.abs(low) + np.abs(drift) * t + np.abs(change)))
+def arrival_of(
+    found: Passing, k: int, parts: tuple[Array, Array], rates: Interval, s: float, step: float, wide: float, *,
+    upper: bool,
+) -> Arrival:  # fmt: skip
+    """When p has come to be between the obstacle's ends: up to ``wide`` deviations earlier (``upper``) or later.
 
-
-def meeting(push: float, pull: float, top: float, s: float, step: float) -> tuple[Array, Array]:
-    """Heights 0 < y_1 < ... < y_n, and bounds of the probability that Y meets 0 within a step from each of them.
-
-    For dY = (push - pull Y) dt + s dW as long as Y < ``top``, so that the last is 0. The least of two: by the scale
-    function, whose integral is bounded piece by piece (its exponent is a parabola), and with the least drift throughout
-    by the reflection principle.
+    Parameters
+    ----------
+    parts : two ndarrays, shape (N,)
+        Least (or largest) distances of p above the obstacle's upper (below its lower) end.
+    wide : float
+        Infinite where bounds of |F| are to serve alone.
     """
-    top = max(top, s * math.sqrt(step))
-    y = top * np.linspace(0, 1, _PIECES + 1) ** 2
-    power = -(2 * push * y - pull * y**2) / s**2
-    size, width = np.exp(power - power.max()), np.diff(y)
-    bow = abs(pull) * width**2 / (4 * s**2)
-    with np.errstate(all="ignore"):
-        above = width * (size[1:] + size[:-1]) / 2 * np.exp(bow)
-        below = width * np.sqrt(size[1:] * size[:-1]) * np.exp(-bow)
-        rest = np.append(np.cumsum(above[::-1])[::-1], 0.0)
-        scale = rest / (rest + np.append(0.0, np.cumsum(below)))
-    scale = np.where(np.isfinite(scale), scale, 1.0)
-    least, root = min(push, push - pull * top), s * math.sqrt(step)
-    tilt = -2 * least * y / s**2
-    tilt = np.where(tilt < 600, np.exp(np.minimum(tilt, 600.0)) * at_most((least * step - y) / root), 1.0)
-    found = np.minimum(np.minimum(scale, at_most(-(y + least * step) / root) + tilt), 1.0) * _UP
-    found = np.minimum.accumulate(np.append(found[:-1], 0.0))
-    chosen = np.unique(np.minimum(np.searchsorted(-found, -_FALLS), _PIECES))
-    chosen = np.append(chosen[(chosen > 0) & (chosen < _PIECES)], _PIECES)
-    return y[chosen], found[chosen]
-
-
-def _arrival(
-    found: Passing, k: int, away: tuple[Array, Array], rates: Interval, s: float, step: float, wide: float
-) -> Array:
-    """Times before which p is not between the obstacle's ends, but for a share Phi(-``wide``); in no step above it."""
-    late = np.zeros(len(rates))
-    for part, speed, turn, start in zip(away, found.speeds, found.turns, (-rates.lo, rates.hi)):
+    sure = math.inf if upper else -math.inf
+    t, lean, loose = np.zeros((3, len(rates)))
+    gap = np.full(len(rates), sure)
+    speeds, turns = (found.speeds, found.turns) if upper else (found.slow, found.slowed)
+    starts = (-rates.lo, rates.hi) if upper else (-rates.hi, rates.lo)  # towards the obstacle
+    late = -1.0 if upper else 1.0
+    for part, speed, turn, start, turned in zip(parts, speeds, turns, starts, (1.0, -1.0)):
+        out = part > 0
         with np.errstate(all="ignore"):
-            first = np.where(part > 0, part / float(speed[k]), 0.0)
+            first = part / float(speed[k]) * (1 + late * 1e-9)
+            own = np.full(len(rates), sure)
             if math.isfinite(turn[k]) and math.isfinite(wide):
-                latest = np.minimum(_root(part, start, float(turn[k])), step)
-                more = float(found.slope[k]) * s * wide * np.sqrt(latest / 3) * _UP
-                first = np.where(part > 0, np.maximum(first, _root(part, start + more, float(turn[k]))), 0.0)
-        late = np.maximum(late, first)
-    return late
+                time, noise = np.full(len(rates), step), float(found.slope[k]) * s * wide
+                for _ in range(4):
+                    time = np.minimum(first_root(
+                        np.maximum(part + late * noise * np.sqrt(time**3 / 3), 0.0), start, float(turn[k])
+                    ), step)  # fmt: skip
+                own = part - start * time + float(turn[k]) * time**2 / 2
+                own += late * 1e-12 * (np.abs(part) + np.abs(start) * time + abs(float(turn[k])) * time**2)
+                better = out & ((time > first) if upper else (time < first))
+                first, own = np.where(better, time, first), np.where(better, own, sure)
+                lead, spread = _together(float(found.pull[k]), time)
+                lean = np.where(better, turned * float(found.tilt[k]) * found.sign * s * lead, lean)
+                loose = np.where(better, float(found.slope[k]) * s * spread, loose)
+        t, gap = np.where(out, first, t), np.where(out, own, gap)
+    return Arrival(t=t, gap=gap, lean=lean, loose=loose)
 
 
-def _root(away: Array, speed: Array, turn: float) -> Array:
+def _together(pull: float, t: Array) -> tuple[Array, Array]:
+    """int_0^t W given int e^{pull u} dW = xi deviations: its mean over xi, and its deviation."""
+    x, small = pull * t, np.abs(pull * t) < 1e-2
+    share = np.where(small, 0.5 + x / 6 + x**2 / 24 + x**3 / 120 + x**4 / 720, 0.0)
+    share = np.where(small, share, (np.expm1(x) - x) / np.where(small, 1.0, x) ** 2)
+    lead = t**2 * share / np.sqrt(np.maximum(grown(2 * pull, t), 1e-300))
+    return lead, np.sqrt(np.maximum(t**3 / 3 - lead**2, 0.0) + 1e-10 * t**3)
+
+
+def first_root(away: Array, speed: Array, turn: float) -> Array:
     """The first t > 0 with away = speed t - turn t^2/2, rounded down; inf without one. For away > 0, speed >= 0."""
     rest = speed**2 * (1 + 1e-12) - 2 * turn * away
     speed = np.maximum(speed, 0.0) * _UP
@@ -278,8 +271,3 @@ def at_most(z: Array) -> Array:
     """Upper bounds of P(N(0, 1) <= z)."""
     flat = (np.asarray(z, dtype=float) / -math.sqrt(2)).ravel().tolist()
     return np.array([math.erfc(value) for value in flat]).reshape(np.shape(z)) * (0.5 * _UP) + 1e-300
-
-
-def whole(rate: float, t: Array) -> Array:
-    """The integral of e^{-rate u} over [0, t]."""
-    return t if rate == 0 else np.asarray(-np.expm1(-rate * t) / rate)
