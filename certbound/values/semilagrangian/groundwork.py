@@ -150,26 +150,22 @@ def _clock(setting: Setting, plan: Plan) -> Clock:
         step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega, begin=whole
     )
     blocks = _rough(setting, replace(first, shear=0.0))
-    known = _some(blocks.known)
+    known = blocks.known
     ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
     return replace(first, shear=float(np.median(ratio)))
 
 
-def _some(known: Mask) -> Mask:
-    """Where blocks are known; InfeasibleError where none is."""
-    if not known.any():
-        raise InfeasibleError(
-            "the model is undefined, or steps of this length cannot be enclosed; value functions prove nothing here."
-        )
-    return known
-
-
 def _rough(setting: Setting, clock: Clock) -> Blocks:
-    """Blocks over the safe set's bounding box in (y, q)."""
+    """Blocks over the safe set's bounding box in (y, q); InfeasibleError where none is known."""
     (p0, p1), (q0, q1) = setting.faces
     away = sorted((clock.shear * q0, clock.shear * q1))
     ends = np.linspace(p0 - away[1], p1 - away[0], 21), np.linspace(q0, q1, 15)
-    return blocks_of(setting, clock, *ends, order=_ORDERS[0])
+    blocks = blocks_of(setting, clock, *ends, order=_ORDERS[0])
+    if not blocks.known.any():
+        raise InfeasibleError(
+            "the model is undefined, or steps of this length cannot be enclosed; value functions prove nothing here."
+        )
+    return blocks
 
 
 def _chunks(axis: Array, count: int) -> tuple[Index, Array]:

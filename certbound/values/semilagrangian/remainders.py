@@ -204,7 +204,8 @@ def _strays(
     middle = np.abs(slope.mid) + slope.rad
     varying = (c.mag[:, 2] > 0) | (c.mag[:, 3] > 0)
     across, width = (np.where(fine, part.hi - part.lo, 0.0) for part in tube)
-    crude = step / 4 * (middle * width + safe(a[:, 0]).mag * across)
+    with np.errstate(over="ignore"):  # of tubes that run away, where nothing is known
+        crude = step / 4 * (middle * width + safe(a[:, 0]).mag * across)
     down = np.where(varying, crude, np.maximum(drift.hi, 0.0) * step**2 / 8)
     over = np.where(varying, crude, np.maximum(-drift.lo, 0.0) * step**2 / 8)
     bow = np.where(varying, 0.0, noise * step**1.5 * middle)
