@@ -37,6 +37,7 @@ _PLANS = (
 Shorter steps ask for smaller cells, since every step pays for its interpolation. There are `_BETWEEN` plans from one to
 the next.
 """
+_ROUGH = 0.2, (1.0, 0.008, 0.4, 0.12)  # where the model changes with time, and all others take too long
 _BETWEEN = 5
 _FIRST = 0.25  # share of the work that a first look may take where no scout tells how rare failing is
 _SPARE = 1e-9
@@ -90,8 +91,9 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     for k, (ratio, cells) in enumerate(chosen):
         plan = _plan(setting, turn, ratio, cells, spare)
         try:
-            upper, least = bounds_by_steps(setting, plan, scout=scout, below=k == len(chosen) - 1)
-            best = min(best, upper)
+            below = setting.timed or k == len(chosen) - 1
+            upper, found = bounds_by_steps(setting, plan, scout=scout, below=below)
+            best, least = min(best, upper), max(least, found)
         except InfeasibleError as error:  # shorter steps may do
             failed = error
             continue
@@ -100,6 +102,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
                 raise
             break
         done.append(f"{plan.count} steps")
+        if setting.timed and (best <= problem.delta or least > problem.delta):
+            break  # every plan takes its time
         spare = _SHARE * best
     if failed is not None and not done:
         raise failed
@@ -142,7 +146,7 @@ def _affordable(
 
     low, high = 0, _BETWEEN * (len(_PLANS) - 1) + 1
     if setting.timed and needed(1) > work:  # the usual case, and every look at a plan costs a second
-        high = 1
+        return [_graded(0)] if needed(0) <= work else [_ROUGH, _graded(0)]
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if needed(middle) <= work else (low, middle)
