@@ -145,10 +145,10 @@ CASES: tuple[Case, ...] = (
     *(Case(name=f"Duffing {s}", problem=lambda s=s: duffing(s), truth="paths", upper=1.25, lower=1.5)
       for s in (0.15, 0.25, 0.4)),
     Case(name="pendulum, torque 1.0", problem=lambda: swing(1.0), truth="paths", upper=1.3, lower=1.5),
-    Case(name="cubic oscillator .5", problem=oscillator, truth="paths", upper=1.5, lower=None),
+    Case(name="cubic oscillator .5", problem=oscillator, truth="paths", upper=1.5, lower=1.5),
     Case(name="around a ball", problem=around_ball, truth="paths", upper=1.2, lower=1.5),
     Case(name="in an ellipse", problem=in_ellipse, truth="paths", upper=1.3, lower=None),
-    Case(name="half-disc in its box", problem=half_disc, truth="paths", upper=1.3, lower=None),
+    Case(name="half-disc in its box", problem=half_disc, truth="paths", upper=1.3, lower=1.5),
     Case(name="Lorenz-like", problem=lorenz, truth="paths", upper=5.0, lower=None),
     Case(name="unicycle", problem=unicycle, truth="paths", upper=2.0, lower=None),
     Case(name="cube", problem=cube, truth="paths", upper=1.5, lower=None),

@@ -115,6 +115,15 @@ def test_who_dips_below_an_end_and_ends_above_it_is_bounded_from_both_sides(
     assert abs(pair[1] - seen) < 0.03 * seen + 4 * math.sqrt(seen / count) + 1e-3
 
 
+def test_who_comes_just_before_the_end_of_a_step_is_not_told_from_who_comes_in_time() -> None:
+    one, h = np.ones(1), 0.08
+    motion = Motion(start=Interval.point(one), drift=Interval.point(one), rate=Interval.point(0 * one), pull=0.0, s=0.1,
+                    step=h)  # fmt: skip
+    never = Arrival(t=h * (1 - 1e-8) * one, gap=np.inf * one, lean=0 * one, loose=0 * one)
+    above, below = (dipped(motion, never, np.zeros(1), upper=upper)[0, 0] for upper in (True, False))
+    assert (above, below) == (1.0, 0.0)
+
+
 def test_who_may_come_in_time_counts_although_most_do_not() -> None:
     """Most end below the obstacle's end without having reached it: nothing is taken off for them."""
     tape = cb.ContinuousSystem(lambda x: [x[1], 0 * x[0]], states=2, diffusion=[[0.0], [0.1]])
