@@ -84,7 +84,8 @@ def dipped(motion: Motion, arrival: Arrival, above: Array, *, upper: bool) -> Ar
     tau = motion.s**2 * grown(2 * k, t)
     own, others = (("lo", "hi") if upper else ("hi", "lo"))
     start, end, other = _sum(motion, own, t), _sum(motion, own, np.array(h)), _sum(motion, others, np.array(h))
-    slack = 1e-12 * (motion.start.mag + (motion.drift.mag + motion.rate.mag * h) * h * math.exp(4 * abs(k) * h))
+    size = motion.start.mag + (motion.drift.mag + motion.rate.mag * h) * h * math.exp(4 * abs(k) * h)
+    slack = (1e-12 + 8e-15 / (1 - t / h)) * size  # a line through two times that are close is off by more
     sign = -1.0 if upper else 1.0
     move = sign * (_bent(motion, own, -sign) * (last - tau) ** 2 / 8 * (1 + 1e-9) + slack)
     slope = (end - start) / (last - tau)
