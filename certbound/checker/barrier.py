@@ -61,14 +61,19 @@ def check_barrier(model: Model, value: object, budget: Budget) -> arb:
         member = held if part.exact else lambda *_: False
         if not negative.prove([nothing, *part.box, *rest], -boundary, _on_states(part.skip, n), member):
             raise Unproved("the barrier was not shown to reach its level where a constraint breaks")
-    generator = expressions.generator
-    if inflow is not None:  # of exp(V - boundary)
+    drift, settled = Ceiling(graph, expressions.generator, expressions.defined, count=count, budget=budget), excluded
+    if inflow is not None:  # of exp(V - boundary): nothing to prove where the generator is not positive
+        slower = drift
         above = graph.sub(expressions.value, graph.const(record.number("boundary")))
-        generator = graph.mul(graph.apply("exp", above), generator)
-    drift = Ceiling(graph, generator, expressions.defined, count=count, budget=budget)
+        generator = graph.mul(graph.apply("exp", above), expressions.generator)
+        drift = Ceiling(graph, generator, expressions.defined, count=count, budget=budget)
+
+        def settled(centre: Sequence[arb], radius: Sequence[arb]) -> bool:
+            return excluded(centre, radius) or slower.holds(centre, radius, arb(0))
+
     box: list[Side] = [(arb(0), arb(model.horizon)), *safe.hull]
     box += [(arb(low), arb(high)) for low, high in model.disturbance]
-    if not drift.prove(box, growth if inflow is None else inflow, excluded, held):
+    if not drift.prove(box, growth if inflow is None else inflow, settled, held):
         raise Unproved("the barrier was not shown to grow as slowly as stated")
     if inflow is not None:
         return upper((start - boundary).exp() + inflow * arb(model.horizon))

@@ -12,6 +12,7 @@ import pytest
 
 import certbound as cb
 from certbound.checker import check_data
+from certbound.checker.expressions import ceiling
 from certbound.errors import CertificateError
 from certbound.safety.answers import exact
 from certbound.safety.certificate import problem_data
@@ -68,6 +69,21 @@ def test_an_inflow_made_by_hand_is_proved_and_sharp() -> None:
     refused = check_data(by_hand(problem, 8.0, 0.0, 0.08 + 1e-9, 8.0 - 1e-9, 2.4180e-4))
     assert not refused.valid
     assert "grow as slowly" in refused.reason
+
+
+def test_where_the_generator_is_negative_its_exponential_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Around a cycle, V = 12 (|x|^2 - 1)^2 - 6.75: exp(V) times a rough range of what is far below 0 is huge."""
+    monkeypatch.setattr(ceiling, "_MOST_BOXES", 8000)
+    system = cb.ContinuousSystem(
+        lambda x: [x[1] + x[0] * (1 - x[0] ** 2 - x[1] ** 2), -x[0] + x[1] * (1 - x[0] ** 2 - x[1] ** 2)], states=2,
+        diffusion=0.15 * np.eye(2),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Ball([0, 0], 1.5)), cb.Outside(cb.Ball([0, 0], 0.5))]
+    data = by_hand(cb.Problem(system, initial=[1.0, 0.0], safe=safe, horizon=2), 0.0, 0.0, -6.75 + 1e-6, -1.0, 0.08)
+    data["proof"]["exponents"] = [[2, 0], [0, 2], [4, 0], [2, 2], [0, 4], [0, 0]]
+    data["proof"]["coefficients"] = exact([-24.0, -24.0, 12.0, 24.0, 12.0, 5.25])
+    report = check_data(data)
+    assert report.valid, report.reason
 
 
 def test_three_states_a_ball_an_obstacle_and_noise_that_depends_on_the_state() -> None:

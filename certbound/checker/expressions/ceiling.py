@@ -107,6 +107,12 @@ class Ceiling:
             stack += [([*current[:place], half, *current[place + 1 :]], depth + 1) for half in halves]
         return not stack
 
+    def holds(self, centre: Sequence[arb], radius: Sequence[arb], bound: arb) -> bool:
+        """Whether one look shows that the expression is at most ``bound`` on the box of these centres and radii."""
+        box = [(c - r, c + r) for c, r in zip(centre, radius)]
+        found = self._bound(box, list(centre), list(radius))
+        return found is not None and bool(found.high <= bound)
+
     def _place(self, radius: list[arb], widths: list[arb], smear: list[arb] | None) -> int:
         """The side to cut: what contributes most, or the widest one relative to the whole box; -1 for a point."""
         best, size = -1, arb(0)

@@ -306,12 +306,10 @@ class _Work:
         start = self._supremum(value, self.start, 0, _anywhere, _TOLERANCE)
         negative = substitute(trace(lambda v: -v[0], {"v": ["v"]}), names, {"v": value})
         exit_ = self._supremum(negative, self.hull, 0, self._leaving, _TOLERANCE)
-        share = _TOLERANCE / horizon
+        share, exponent = _TOLERANCE / horizon, None
         if steady:
-            share *= math.exp(max(min(start.upper, 0.0), -_LOWEST))
-            whole = trace(lambda v, g: np.exp(v[0]) * g[0], {"v": ["v"], "g": ["g"]})
-            generator = substitute(whole, generator.inputs, {"v": value, "g": generator})
-        growth = self._supremum(generator, self.ranges, 1, self._safe, share)
+            share, exponent = share * math.exp(max(min(start.upper, 0.0), -_LOWEST)), value
+        growth = self._supremum(generator, self.ranges, 1, self._safe, share, exponent)
         if not (np.isfinite(growth.upper) or steady):  # V is finite everywhere: no other one would help
             raise EngineError(
                 "the dynamics have no finite enclosure near ("
@@ -354,24 +352,28 @@ class _Work:
         return substitute(trace(expression, names), self.problem.closed_loop.inputs, replaced)
 
     def _supremum(
-        self, tape: Tape, box: Interval, first: int, keep: Callable[[Interval], Mask], tolerance: float
-    ) -> Any:
-        """Bound a function over the part of a box that ``keep`` does not rule out; states begin at ``first``."""
-        slope, function = jacobian(tape), compile_numpy(tape)
-        count = len(box)
+        self, tape: Tape, box: Interval, first: int, keep: Callable[[Interval], Mask], tolerance: float,
+        exponent: Tape | None = None,
+    ) -> Any:  # fmt: skip
+        """Bound a function over the part of a box that ``keep`` does not rule out; states begin at ``first``.
+
+        With an ``exponent`` V of the states it is e^V times the function, whose sign is then decided without e^V.
+        """
+        factors = [tape]
+        if exponent is not None:
+            whole = trace(lambda v, g: np.exp(v[0]) * g[0], {"v": ["v"], "g": ["g"]})
+            exponent = substitute(exponent, tape.inputs, {})
+            factors = [substitute(whole, tape.inputs, {"v": exponent, "g": tape}), exponent, tape]
+        slopes, function = [jacobian(factor) for factor in factors], compile_numpy(factors[0])
 
         def bound(boxes: Interval, _: float) -> tuple[Array, Array]:
-            middle = Interval.point(boxes.mid)
-            inputs = [boxes[:, k] for k in range(count)]
-            whole = enclose(tape, inputs, undefined="infinite")[:, 0]
-            at = enclose(tape, [middle[:, k] for k in range(count)], undefined="infinite")[:, 0]
-            gradient = enclose(slope, inputs, undefined="infinite")[:, 0]
-            with np.errstate(invalid="ignore"):
-                centred = at + (gradient * (boxes - middle)).sum(axis=-1)
-                weights = np.nan_to_num(gradient.mag * boxes.rad, nan=np.inf, posinf=np.inf)
-            upper = np.fmin(whole.hi, np.where(np.isnan(centred.hi), np.inf, centred.hi))
+            ranges, weights = zip(*(_enclosed(factor, slope, boxes) for factor, slope in zip(factors, slopes)))
+            upper = ranges[0].hi
+            if exponent is not None:
+                with np.errstate(invalid="ignore", over="ignore"):
+                    upper = np.fmin(upper, (exp(ranges[1]) * ranges[2]).hi)
             held = keep(boxes[:, first : first + self.n])
-            return np.where(held, np.where(np.isnan(upper), np.inf, upper), -np.inf), weights
+            return np.where(held, upper, -np.inf), weights[0]
 
         def value(points: Array) -> Array:
             with np.errstate(all="ignore"):
@@ -390,6 +392,19 @@ class _Work:
         gaps = [gap.over(boxes) for gap in self.gaps]
         near = np.any([gap.hi >= 0 for gap in gaps], axis=0)
         return np.asarray(np.all([gap.lo <= 0 for gap in gaps], axis=0) & near)
+
+
+def _enclosed(tape: Tape, slope: Tape, boxes: Interval) -> tuple[Interval, Array]:
+    """Ranges of a function over boxes, natural and centred, and how much each coordinate adds to them."""
+    middle = Interval.point(boxes.mid)
+    inputs, at = ([part[:, k] for k in range(boxes.shape[1])] for part in (boxes, middle))
+    whole = enclose(tape, inputs, undefined="infinite")[:, 0]
+    gradient = enclose(slope, inputs, undefined="infinite")[:, 0]
+    with np.errstate(invalid="ignore"):
+        centred = enclose(tape, at, undefined="infinite")[:, 0] + (gradient * (boxes - middle)).sum(axis=-1)
+        weights = np.nan_to_num(gradient.mag * boxes.rad, nan=np.inf, posinf=np.inf)
+        low, high = np.fmax(whole.lo, centred.lo), np.fmin(whole.hi, centred.hi)
+    return Interval(np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)), weights
 
 
 def _anywhere(boxes: Interval) -> Mask:

@@ -109,6 +109,21 @@ def test_an_inflow_stays_near_the_truth_where_noise_keeps_moving() -> None:
     assert answer.log10_delta == pytest.approx(found.log10_probability(8.0), abs=0.3)
 
 
+def test_where_a_steep_polynomial_falls_is_decided_without_its_exponential() -> None:
+    """Around a cycle, V = 14 (|x|^2 - 1)^2 - 7.875: exp(V) times a rough range of what is far below 0 is huge."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1] + x[0] * (1 - x[0] ** 2 - x[1] ** 2), -x[0] + x[1] * (1 - x[0] ** 2 - x[1] ** 2)], states=2,
+        diffusion=0.15 * np.eye(2),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Ball([0, 0], 1.5)), cb.Outside(cb.Ball([0, 0], 0.5))]
+    work = engine._Work(cb.Problem(system, initial=[1.0, 0.0], safe=safe, horizon=10), system)
+    powers = np.array([[2, 0], [0, 2], [4, 0], [2, 2], [0, 4]])
+    unit = work.scale[0] ** powers.sum(axis=1)
+    found, _ = work._certified(powers, np.append([-28, -28, 14, 28, 14] * unit, 14 - 7.875), steady=True)
+    assert found is not None
+    assert found.log10_probability(10.0) < -2
+
+
 def test_a_steady_polynomial_takes_few_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tangents far above the level that the last polynomial serves lead down by a factor e each."""
     asked, solved = [], barrier_programs._solved
