@@ -82,6 +82,8 @@ class EngineAnswer:
         Where that is, and for which constraint (None if nothing could be evaluated).
     reason : str
         One or two sentences for humans: what was proved, or what stood in the way and what would work.
+    below : str
+        Of ``reason`` what shows the lower bound, where that was found before the rest.
     tube : Any
         The stochastic tube at the target probability, if the engine has one.
     reach : ReachTube or None
@@ -118,6 +120,7 @@ class EngineAnswer:
     time: float | None = None
     constraint: str | None = None
     reason: str = ""
+    below: str = ""
     tube: Any = None
     reach: ReachTube | None = None
     constants: Constants | None = None
@@ -226,8 +229,9 @@ def with_lower(answer: EngineAnswer, before: EngineAnswer | None) -> EngineAnswe
         return before
     if answer.log10_lower is not None and answer.log10_lower >= before.log10_lower:
         return answer
-    words = f"{before.reason.rstrip('.')}; and {answer.reason}" if answer.reason else before.reason
-    return replace(answer, log10_lower=before.log10_lower, reason=words)
+    below = before.below or before.reason
+    words = f"{answer.reason.rstrip('.')}; {below}" if answer.reason else below
+    return replace(answer, log10_lower=before.log10_lower, reason=words, below=below)
 
 
 def settled(log10_delta: float, target: float) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from certbound.rigor.norms import Norm
-from certbound.safety.answers import Deviation, is_at_most, settled
+from certbound.safety.answers import Deviation, EngineAnswer, is_at_most, settled, with_lower
 
 
 @pytest.mark.parametrize("delta", [0.5, 1e-3, 0.002, 1e-12, 0.9999])
@@ -38,3 +38,11 @@ def test_a_ball_gives_euclidean_size_and_extent_per_state():
     assert deviation.radius == pytest.approx([2.0, 6.0], rel=1e-9)
     assert deviation.extent == pytest.approx(np.array([[0.5, 2.0], [1.5, 6.0]]), rel=1e-9)
     assert np.all(deviation.extent >= np.array([[0.5, 2.0], [1.5, 6.0]]))
+
+
+def test_what_shows_a_lower_bound_is_said_once_and_after_the_upper_bound() -> None:
+    kept = EngineAnswer(log10_lower=-2.0, reason="it breaks.")
+    for number in range(3):
+        kept = with_lower(EngineAnswer(log10_delta=-1.0, reason=f"bound {number}."), kept)
+    assert kept.log10_lower == -2
+    assert kept.reason == "bound 2; it breaks."
