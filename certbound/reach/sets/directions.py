@@ -96,19 +96,22 @@ def _constraint(constraint: Inside, curve: NominalPieces, states: tuple[str, ...
             a, b = _facets(region, form, curve)
             for index in range(len(a)):
                 rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
-                text = label if len(a) == 1 else f"{label}, side {index + 1}{_side(region, a[index], index, states)}"
+                side, text = _side(region, a[index], index, states), label
+                if len(a) > 1:
+                    named = region.kind != "box" or label != region.describe(states, constraint.word)
+                    text = side if side and not named else f"{label}, side {index + 1}{side and f' ({side})'}"
                 yield text, rows, curve.least(rows, b[:, index])
 
 
 def _side(region: Region, row: Array, index: int, states: tuple[str, ...]) -> str:
-    """One side of a resting set as an inequality in brackets."""
+    """One side of a resting set as an inequality."""
     if region.moving or not isinstance(region.form, Faces):
         return ""
     bound = float(region.form.bounds[index] + region.form.normals[index] @ region.center_at())
     sign = -1.0 if np.count_nonzero(row) == 1 and row.sum() < 0 else 1.0
     factors = {1.0: "", -1.0: "-"}
     parts = [f"{factors.get(sign * a, f'{sign * a:g}*')}{name}" for a, name in zip(row, states) if a]
-    return f" ({' + '.join(parts).replace('+ -', '- ')} {'<=' if sign > 0 else '>='} {sign * bound + 0.0:g})"
+    return f"{' + '.join(parts).replace('+ -', '- ')} {'<=' if sign > 0 else '>='} {sign * bound + 0.0:g}"
 
 
 def _outside_facet(region: Region, form: Faces, label: str, curve: NominalPieces) -> tuple[str, Array, Array]:

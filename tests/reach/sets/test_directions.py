@@ -30,6 +30,14 @@ def test_a_box_in_some_coordinates_asks_nothing_of_the_others() -> None:
     np.testing.assert_allclose([r.room[0] for r in found], [0.75, 1.5, 1.25, 2.5], rtol=1e-12)
 
 
+def test_a_side_of_a_box_is_named_by_its_inequality_and_by_the_users_words_if_there_are_any() -> None:
+    box = cb.Box([-1, -2], [1, 2], coordinates=(2, 0))
+    sides = [r.label for r in rooms(cb.Inside(box), [0.5, 9.0, 0.25])]
+    assert sides == ["x3 <= 1", "x1 <= 2", "x3 >= -1", "x1 >= -2"]
+    named = [r.label for r in rooms(cb.Inside(box, label="lane"), [0.5, 9.0, 0.25])]
+    assert named[0] == "lane, side 1 (x3 <= 1)"
+
+
 def test_the_rooms_of_a_moving_box_move_with_it() -> None:
     box = cb.Box([-1, -1, -1], [1, 1, 1], center=lambda t: [0.3 * t, 0, 0])
     upper, lower = (r.room for r in rooms(cb.Inside(box), [0.0, 0.0, 0.0])[::3])
