@@ -64,6 +64,9 @@ reach.sets reach.remainder
 reach.contraction reach.linear reach.sampled
 reach.below
 reach
+quadratic.form_matrices quadratic.conic
+quadratic.setting
+quadratic.steps
 quadratic
 safety.answers safety.falsification
 safety.engines safety.starts safety.first_exits

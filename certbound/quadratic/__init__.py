@@ -1,7 +1,8 @@
-"""Quadratic value bounds by semidefinite programming (Thm K9): several states, everyday noise, continuous time."""
+"""Quadratic value bounds by semidefinite programming (Thm K9): several states, everyday noise."""
 
 from __future__ import annotations
 
 from certbound.quadratic.refinement import QuadraticBound, bound_quadratic
+from certbound.quadratic.steps import StepsBound, bound_steps
 
-__all__ = ["bound_quadratic", "QuadraticBound"]
+__all__ = ["QuadraticBound", "StepsBound", "bound_quadratic", "bound_steps"]

@@ -94,3 +94,12 @@ def splitting(n: int, held: Sequence[int]) -> Array:
                 member[a, j, i] += 0.0 if i == j else sign / 2
             basis.append(member)
     return np.array(basis) if basis else np.zeros((0, len(held), n + 1, n + 1))
+
+
+def symmetric_basis(size: int) -> Array:
+    """A basis of the symmetric matrices, shape (size, size, size (size + 1) / 2)."""
+    pairs = [(i, j) for i in range(size) for j in range(i, size)]
+    basis = np.zeros((size, size, len(pairs)))
+    for k, (i, j) in enumerate(pairs):
+        basis[i, j, k] = basis[j, i, k] = 1.0
+    return basis

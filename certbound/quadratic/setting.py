@@ -143,7 +143,7 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
     refuse(problem)
     safe = safe_sides(problem)
     center, width = _scaled(low, high)
-    n = len(center)
+    n, jumps = len(center), not isinstance(problem.system, ContinuousSystem)  # a step may lead beyond any side
     start = _start(problem, center, width)
     walls: list[Wall | None] = []
     inside: list[Interval] = []
@@ -155,7 +155,7 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
     for axis, sign in itertools.product(range(n), (-1.0, 1.0)):
         z = _side(n, axis, sign)
         beyond = (z.reshape(-1, 1) * known * z.reshape(1, -1)).sum(axis=(-1, -2)).hi < 0
-        if not np.any(beyond) and not _never_reached(problem, center, width, axis, sign):
+        if jumps or not (np.any(beyond) or _never_reached(problem, center, width, axis, sign)):
             row = np.zeros(n + 1)
             row[axis], row[n] = sign, -1.0
             label = f"{problem.system.states[axis]} {'above' if sign > 0 else 'below'}"
@@ -250,8 +250,8 @@ def _check_start(start: Start, form: Interval, label: str) -> None:
 
 def _flat(problem: Problem, center: Array, width: Array, row: Interval, label: str) -> Wall | None:
     """A flat wall; one without noise is left only where the drift points outward, and None where it nowhere does."""
-    n = len(center)
-    drift = _outward_drift(problem, center, width, row)
+    n, continuous = len(center), isinstance(problem.system, ContinuousSystem)
+    drift = _outward_drift(problem, center, width, row) if continuous else None
     forms = [] if drift is None else [linear_form(drift)]
     if drift is not None:
         used = np.flatnonzero(row.mag[:n])

@@ -17,7 +17,7 @@ import numpy as np
 from certbound.arrays import Array, Integers
 from certbound.quadratic.conic import Block, Part, Program, block
 from certbound.quadratic.corners import Cells
-from certbound.quadratic.form_matrices import side_forms, splitting
+from certbound.quadratic.form_matrices import side_forms, splitting, symmetric_basis
 from certbound.quadratic.setting import Setting, Wall
 
 _DEEPEST = -120.0  # log of the smallest probability that is looked for
@@ -68,15 +68,6 @@ class Proposal:
 def slopes(degree: int) -> tuple[tuple[int, int, float], ...]:
     """Of each control point of a piece: (a, b, c) such that c (H_b - H_a) / length is that of the slope in time."""
     return ((0, 1, 1.0), (0, 1, 1.0)) if degree == 1 else ((0, 1, 2.0), (0, 2, 1.0), (1, 2, 2.0))
-
-
-def symmetric_basis(size: int) -> Array:
-    """A basis of the symmetric matrices, shape (size, size, size (size + 1) / 2)."""
-    pairs = [(i, j) for i in range(size) for j in range(i, size)]
-    basis = np.zeros((size, size, len(pairs)))
-    for k, (i, j) in enumerate(pairs):
-        basis[i, j, k] = basis[j, i, k] = 1.0
-    return basis
 
 
 def start_frame(setting: Setting) -> tuple[Integers, Array]:

@@ -152,8 +152,8 @@ ENGINES: dict[str, Engine] = {
         ),
         Engine(
             name="quadratic",
-            words="one quadratic value bound a wall of the safe set, by semidefinite programming (Thm K9, continuous "
-            "time, up to twelve states)",
+            words="one quadratic value bound a wall of the safe set, by semidefinite programming (Thm K9, up to "
+            "twelve states)",
             when="while nothing else has proved SAFE; says most in three to ten states where the noise is too "
             "large for a linearisation",
             prove=by_logarithms(in_coordinates(quadratic_engine)),

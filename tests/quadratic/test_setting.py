@@ -120,19 +120,3 @@ def test_who_asks_for_it_alone_gives_it_all_of_his_time(
         quadratic_engine(of([cb.Inside(cb.Box([-1] * 3, [1] * 3))], system=cooling, initial=[0] * 3),
                          Request(thorough=thorough))  # fmt: skip
     assert granted[0] == pytest.approx(most, abs=0.5)
-
-
-def test_discrete_time_is_not_served() -> None:
-    system = cb.DiscreteSystem(lambda x: 0.5 * x, states=1, noise=cb.Gaussian(std=0.1))
-    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=3)
-    assert "continuous time" in quadratic_engine(problem).reason
-
-
-def test_a_plan_that_is_an_array_is_refused_before_anything_is_searched() -> None:
-    system = cb.ContinuousSystem(
-        lambda x, u: [x[1], x[2], u[0] - x[0]], states=3, inputs=cb.Box([-1], [1]), diffusion=np.eye(3)
-    )
-    safe = [cb.Inside(cb.HalfSpace([1.0, 0, 0], 1.0))]
-    problem = cb.Problem(system, initial=np.zeros(3), safe=safe, horizon=1.0, plan=np.zeros((4, 1)))
-    with pytest.raises(InfeasibleError, match="the plan is an array"):
-        bound_quadratic(problem)

@@ -30,6 +30,8 @@ def quadratic_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) ->
 
     CertificateError where the checker knows no proof of what was bounded.
     """
+    if problem.system.time == "discrete":
+        raise CertificateError("no certificate states quadratic value bounds in discrete time yet.")
     found: QuadraticBound | None = answer.details
     if found is None or found.setting is None or not found.upper < 0:
         raise CertificateError("no quadratic value bound was found.")

@@ -1,4 +1,4 @@
-"""The engine of quadratic value bounds (Thm K9): several states at everyday noise, continuous time."""
+"""The engine of quadratic value bounds (Thm K9): several states at everyday noise."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.quadratic import QuadraticBound, bound_quadratic
+from certbound.quadratic import QuadraticBound, StepsBound, bound_quadratic, bound_steps
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.watch import seconds_left
 
@@ -34,8 +34,14 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         alone = asked.at_length or (asked.thorough and problem.system.dimension >= _FEW and left < math.inf)
         most = min(most, _HASTE) if asked.first else most
         limit = max(left if alone else min(_SECONDS if asked.thorough else most, left), _LEAST)
+        target = _ANY if asked.first else problem.delta
+        if problem.system.time == "discrete":
+            before = asked.before if isinstance(asked.before, StepsBound) else StepsBound()
+            return _answer(before if before.complete else bound_steps(
+                problem, target=target, seconds=limit, found=lambda bound: asked.found(_answer(bound)),
+            ))  # fmt: skip
         best = bound_quadratic(
-            problem, target=_ANY if asked.first else problem.delta, seconds=limit, before=asked.before,
+            problem, target=target, seconds=limit, before=asked.before,
             found=lambda bound: asked.found(_answer(bound)),
         )  # fmt: skip
     except (InfeasibleError, EnclosureError) as error:
@@ -43,5 +49,5 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     return _answer(best)
 
 
-def _answer(bound: QuadraticBound) -> EngineAnswer:
+def _answer(bound: QuadraticBound | StepsBound) -> EngineAnswer:
     return EngineAnswer(log10_delta=bound.upper, reason=bound.words + ".", method="quadratic", details=bound)
