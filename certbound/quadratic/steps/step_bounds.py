@@ -34,7 +34,8 @@ _EACH = 8, 24  # steps before a window with an H of their own
 _SAME = 0.02  # of log10: what a bound may lose when it is turned to the opposite side
 _GROWTH = 1.4  # of the pieces before these
 _PATHS, _SEED = 200, 21
-_MARGINS = (7.0, 4.5)  # standard deviations beyond sampled paths, of sides that the safe set does not have
+_BOXES = (7.0, True), (5.0, False), (4.0, False)
+"""Standard deviations beyond sampled paths of the box's sides, and whether the safe set's sides stay as they are."""
 _MOST_CORNERS = 8  # log2 of those of the starts
 _INFLATED = 1e-12
 _SMALLEST = -300.0  # log10 of what is told apart from 0
@@ -233,17 +234,14 @@ def _columns(problem: Problem, setting: Setting) -> Array:
 
 
 def _settings(problem: Problem) -> Iterator[Setting]:
-    """Working boxes: the safe set's own sides, and sides beyond sampled paths where it has none."""
+    """Working boxes: the safe set's own sides and sides beyond sampled paths where it has none; then narrower ones."""
     low, high = safe_sides(problem)
     bottom, top, spread = _sampled(problem, low, high)
-    seen = set()
-    for margin in _MARGINS:
+    for margin, free in _BOXES:
         reach = margin * spread + 0.05 * (top - bottom) + 1e-6 * (1 + np.abs(top))
-        ends = np.where(np.isfinite(low), low, bottom - reach), np.where(np.isfinite(high), high, top + reach)
-        key = ends[0].tobytes() + ends[1].tobytes()
-        if key not in seen:
-            seen.add(key)
-            yield make_setting(problem, *ends)
+        own = np.maximum(low, bottom - reach), np.minimum(high, top + reach)
+        kept = np.where(np.isfinite(low), low, own[0]), np.where(np.isfinite(high), high, own[1])
+        yield make_setting(problem, *(kept if free else own))
 
 
 def _sampled(problem: Problem, low: Array, high: Array) -> tuple[Array, Array, Array]:

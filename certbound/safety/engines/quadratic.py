@@ -16,6 +16,7 @@ _LEAST = 0.1
 _ANY = 1.0  # a target that any bound meets, even none: what the first walls say, unrefined
 _HASTE = 4.0  # seconds for these: the engine at work waits
 _FEW = 3  # states below which value functions on grids say more
+_LONG = 100  # steps from which on two states are asked for too
 
 
 def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
@@ -25,7 +26,8 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     """
     if asked.quick:
         return EngineAnswer(applicable=False, method="quadratic", reason=SPARED)
-    if not asked.thorough and problem.system.dimension < _FEW:
+    long = problem.system.time == "discrete" and problem.horizon >= _LONG  # a grid takes its time at every step
+    if not asked.thorough and problem.system.dimension < (2 if long else _FEW):
         reason = "left to value functions on grids, which say more in one or two states."
         return EngineAnswer(applicable=False, method="quadratic", reason=reason)
     try:
