@@ -167,6 +167,8 @@ class Transition:
         spreads = _deviations(steps.model)
         self._scales = [(float((1 / s).mid()), above(abs(1 / s - float((1 / s).mid())))) for s in spreads]
         self._spacing = [float(s.mid()) / PER_DEVIATION for s in spreads]
+        if not all(width > 0 and math.isfinite(scale) for width, (scale, _) in zip(self._spacing, self._scales)):
+            raise Unproved("the noise is too small for value functions in floats")
         points = [self._points(i, after.edges[i]) for i in range(self.n)]
         if np.prod([len(one) for one in points]) > _MOST_POINTS:
             raise Unproved(f"the mesh around the images would have more than {_MOST_POINTS} points")
