@@ -92,6 +92,7 @@ def test_a_worse_problem_is_found_worse():
         ({"paths": float("nan")}, ValueError, "`paths` must be a positive whole number, got nan"),
         ({"paths": "many"}, TypeError, "`paths` must be a positive whole number, got 'many'"),
         ({"paths": True}, TypeError, "`paths` must be a positive whole number, got True"),
+        ({"paths": 1e15}, ValueError, r"`paths` must be at most 1e\+12, got 1e\+15"),
         ({"steps": 0}, ValueError, "`steps` must be a positive whole number, got 0"),
         ({"steps": 10**12}, ValueError, r"`steps` must be at most \d+ for this problem"),
         ({"confidence": 1.0}, ValueError, "`confidence` must lie in"),
