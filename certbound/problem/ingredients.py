@@ -155,9 +155,15 @@ def checked_unknown(value: Any, known: Sequence[str]) -> tuple[str, ...]:
     return found
 
 
+def _table(name: str, value: Any) -> dict[str, Any]:
+    if value is not None and not isinstance(value, Mapping):
+        raise TypeError(f"`{name}` must be a dict by names, got {value!r}.")
+    return dict(value or {})
+
+
 def checked_random(value: Any, known: Sequence[str], unknown: Sequence[str]) -> dict[str, Random]:
     """Constants that are drawn, by the names of their disturbances."""
-    found: dict[str, Random] = dict(value or {})
+    found: dict[str, Random] = _table("random", value)
     for name, constant in found.items():
         if name not in known:
             raise ValueError(f"`random` must name disturbances of the system, got {name!r}{nearest(str(name), known)}")
@@ -171,7 +177,7 @@ def checked_random(value: Any, known: Sequence[str], unknown: Sequence[str]) -> 
 def checked_units(value: Any, system: System) -> dict[str, str]:
     """Units by the names of signals, and of ``time``: short printable texts."""
     known = ("time", *system.states, *system.input_names, *system.disturbance_names)
-    found = dict(value or {})
+    found = _table("units", value)
     for name, unit in found.items():
         if name not in known:
             raise ValueError(f"`units` must name time or signals, got {name!r}{nearest(str(name), known)}")

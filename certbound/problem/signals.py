@@ -52,7 +52,13 @@ def signal_names(
 
 def _noise_matrix(name: str, value: Any, states: Sequence[str]) -> Array:
     n = len(states)
-    array = np.asarray(value, dtype=float) if not isinstance(value, (int, float)) else np.array(float(value))
+    try:
+        raw = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raw = np.asarray("")
+    if raw.dtype.kind not in "biufO":
+        raise TypeError(f"`{name}` must hold numbers, in rows of equal length, got {value!r}.")
+    array = raw.astype(float)
     if array.ndim < 2 and n == 1:
         array = array.reshape(1, -1)
     if array.ndim == 0:

@@ -54,6 +54,8 @@ def decide(
 
     Without a watch the one that runs already, if any, ends the search.
     """
+    if not isinstance(method, str):
+        raise TypeError(f"`method` must be the name of one, got {method!r}; leave it out for the best of all engines.")
     plain = "auto" if method in ENGINES else method
     request = Request(method=plain, cells=cells, constants=constants, thorough=method != "auto")
     names = engines_of(method)

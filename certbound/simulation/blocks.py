@@ -20,7 +20,7 @@ Counts = NDArray[np.int64]
 BLOCK = 1024
 """Paths per block."""
 
-_MOST = 1e15  # of anything that is counted: floats count no further than 9e15
+_MOST = 1e12  # of anything that is counted: a mark for every chunk of so many paths takes 25 MB
 
 MEMORY_LIMIT = 512 * 2**20
 """Bytes that the arrays of one simulation may take."""

@@ -4,8 +4,8 @@ A kernel advances the paths of one block one after the other, with the state in 
 inside the loop; its memory does not grow with paths or steps.
 
 Continuous time: Euler-Maruyama, x + f h + g sqrt(h) z, with Milstein's term 1/2 g g' h (z^2 - 1) where g is
-diagonal and each entry depends on its own state alone (then the term is exact and costs no further variate);
-linear systems step by their exact transition, which is a discrete model.
+diagonal and each entry depends on its own state alone (then the term is exact and costs no further variate), but 0
+where g is; linear systems step by their exact transition, which is a discrete model.
 """
 
 from __future__ import annotations
@@ -239,9 +239,10 @@ def _noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridg
         if model.correction is not None:
             drawn += [f"{_targets(vector('c', n))} = correction(p, t, {', '.join(vector('x', n))})"]
             half = p.add(0.5 * model.step)
+            own = [row[i] for i, row in enumerate(entries)]  # where one is 0, a root's slope is no number
             shocks = [
-                f"{s} + {half} * c_{i} * {entries[i][i]} * (z_{i} * z_{i} - 1.0)" if entries[i][i] != "0.0" else s
-                for i, s in enumerate(shocks)
+                f"{s} + ({half} * c_{i} * {e} * (z_{i} * z_{i} - 1.0) if {e} != 0.0 else 0.0)" if e != "0.0" else s
+                for i, (s, e) in enumerate(zip(shocks, own))
             ]
         scaled = [[f"({root} * {e})" if e != "0.0" else e for e in row] for row in entries]
         bridge = Bridge(spread=None, entries=scaled) if model.bridge else None

@@ -73,7 +73,7 @@ def jacobians(model: StepModel, steps: int, start: Any) -> _Matrices:
 def step_error(matrices: _Matrices, step: float, horizon: float, base: Array | None = None) -> float:
     """The largest error of a mode's rate, over what is allowed: a fifth of it, or of one e-folding in the horizon.
 
-    Of Euler's scheme; with ``base`` of the scheme that is exact where J is that.
+    Of Euler's scheme; with ``base`` of the scheme that is exact where J is that, infinite where that has no numbers.
 
     Examples
     --------
@@ -91,7 +91,10 @@ def step_error(matrices: _Matrices, step: float, horizon: float, base: Array | N
             if move is None:
                 grown, right = np.log(np.abs(1.0 + step * rates)), step * rates.real
             else:
-                moved = np.abs(np.linalg.eigvals(np.eye(len(matrix)) + move @ matrix))
+                scheme = np.eye(len(matrix)) + move @ matrix
+                if not np.all(np.isfinite(scheme)):
+                    return float("inf")
+                moved = np.abs(np.linalg.eigvals(scheme))
                 rates = rates[np.argsort(rates.real)]
                 grown, right = (np.maximum(x, np.log(_DEAD)) for x in (np.log(np.sort(moved)), step * rates.real))
         allowed = _TOLERANCE * step * np.maximum(np.abs(rates.real), 1.0 / horizon)

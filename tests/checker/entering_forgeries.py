@@ -125,6 +125,17 @@ def _(data: Data) -> None:
     _target(data, high=[0.099])
 
 
+@forges(
+    "who meets an obstacle and the target at once has failed", "arriving", _FILE, "_ArrivingBelow._harmless_sides",
+    "no bound below 1",
+)  # fmt: skip
+def _(data: Data) -> None:
+    data["problem"]["constraints"].append({
+        "kind": "outside", "during": None, "label": "x <= .1",
+        "region": {"kind": "halfspace", "normal": exact([1.0]), "bound": exact(0.1)},
+    })
+
+
 @forges("the worst start arrives", "arriving", _FILE, "_ArrivingBelow._level", MORE)
 def _(data: Data) -> None:
     data["problem"]["initial"]["high"] = exact([0.51])

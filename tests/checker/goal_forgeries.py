@@ -50,6 +50,13 @@ def tailed(**options) -> cb.Problem:
     return _walk(**options).replace(system=system)
 
 
+def tossed() -> cb.Problem:
+    """To 1, the end of the domain and of an obstacle, or to 0."""
+    system = cb.DiscreteSystem(lambda x: 0.5 + 0 * x, states=["x"], noise=cb.Rademacher(scale=0.5))
+    limits = {"safe": [cb.Outside(cb.Box([1.0], [2.0]))], "domain": cb.Box([-1], [1]), "leaving": "ends"}
+    return cb.Problem(system, initial=[0.25], horizon=1, delta=0.7, **limits)
+
+
 def long() -> cb.Problem:
     """More steps than are looked at."""
     system = cb.DiscreteSystem(lambda x: 0.5 * x, states=["x"], noise=cb.Gaussian(std=0.2))
@@ -72,6 +79,7 @@ _BASES |= {
     "multiplied": _sharp(_stated(multiplied, "values")),
     "multiplied below": _sharp(_below(partial(multiplied, delta=_LOW))),
     "tailed": _sharp(_stated(tailed, "values")),
+    "tossed": _sharp(_stated(tossed, "values")),
     "long": _sharp(_stated(long, "values")),
     "endless": _sharp(_stated(endless, "values")),
     "endless below": _sharp(_below(partial(endless, delta=_LOW))),
@@ -197,6 +205,12 @@ def _(data: Data) -> None:
 @forges("pieces are of independent noise", "multiplied", _PIECES, "pieces_of", "independent entries")
 def _(data: Data) -> None:
     data["problem"]["noise"] |= {"law": "bounded", "level": "halfwidth", "independent": False}
+
+
+@forges("who touches an obstacle by noise in pieces has failed", "tossed", _STEP, "zones", MORE)
+def _(data: Data) -> None:
+    data["proof"]["grids"] = [[exact([-1.0, 0.5, 1.0])]]
+    data["claim"]["log10_delta"] = exact(-3.0)
 
 
 @forges("only value functions know steps whose noise the state multiplies", "still", "claims.py", "prove", "multi")

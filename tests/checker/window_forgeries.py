@@ -161,6 +161,19 @@ def _(data: Data) -> None:
     _limit(data, 2, box=0.49)
 
 
+@forges(
+    "parts on both sides of an obstacle of no width touch it", "passing", "statement/safe_set.py", "_Shape.keeps",
+    "no bound below 1",
+)  # fmt: skip
+def _(data: Data) -> None:
+    edges = data["proof"]["stages"][-1]["axes"][0]
+    place = [edges[len(edges) // 2]]
+    data["problem"]["constraints"].append({
+        "kind": "outside", "during": exact([0.4, 0.4]), "label": "a point",
+        "region": {"kind": "box", "low": place, "high": place, "center": None, "coordinates": None},
+    })
+
+
 @forges("V is at least 0 where the next stage is silent", "passing", _FILE, "_StageAbove.join", MORE)
 def _(data: Data) -> None:
     _elsewhere(data, 0.0)

@@ -225,6 +225,13 @@ def test_a_start_outside_the_safe_set_is_refused(start, constraint, fault):
         problem(initial=start, safe=[constraint])
 
 
+def test_a_centre_that_is_undefined_at_the_start_is_refused_by_name():
+    gone = Ball(lambda t: [1 / t, 0.5], 0.1)
+    with pytest.raises(ValueError, match=r"centres that are defined .* 'gone' is \[inf, 0\.5\] at time 0"):
+        problem(safe=[Outside(gone, label="gone")])
+    problem(safe=[Outside(gone, label="gone", during=(0.5, 1.0))])
+
+
 @pytest.mark.parametrize(
     ("start", "constraint"),
     [

@@ -211,6 +211,8 @@ def test_sizes_and_names_are_checked(build, message):
             lambda: DiscreteSystem(lambda x: x, states=2, noise=0.1),
             r"`noise` must be a law, got 0\.1; .*cb\.Gaussian\(std=",
         ),
+        (lambda: ContinuousSystem(lambda x: x, states=1, diffusion="0.1"), "`diffusion` must hold .* got '0.1'"),
+        (lambda: ContinuousSystem(lambda x: x, states=2, diffusion=[[0], [1, 2]]), "in rows of equal length, got"),
         (lambda: ContinuousSystem(lambda x: x), "`states` must be given"),
         (lambda: ContinuousSystem(lambda x: x, states="abc"), "`states` must be a number or a list of names"),
         (lambda: ContinuousSystem(lambda x: x, states=True), "`states` must be a number or a list of names"),

@@ -89,3 +89,9 @@ def test_files_and_certificates_keep_them(problem, verdict, tmp_path):
 def test_what_is_no_unit_is_refused(problem, units, message):
     with pytest.raises(ValueError, match=message):
         problem.replace(units=units)
+
+
+@pytest.mark.parametrize("name", ["units", "random"])
+def test_a_table_by_names_is_asked_for(problem, name):
+    with pytest.raises(TypeError, match=f"`{name}` must be a dict by names, got 3"):
+        problem.replace(**{name: 3})

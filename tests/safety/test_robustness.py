@@ -191,6 +191,11 @@ def test_bad_input_is_refused_before_any_engine_runs(options: dict[str, Any], me
         verify_safety(sine_map(), **options)
 
 
+def test_a_method_that_is_no_text_is_refused_by_name() -> None:
+    with pytest.raises(TypeError, match="`method` must be the name of one, got"):
+        verify_safety(sine_map(), method=["linear"])  # type: ignore[arg-type]
+
+
 # ---- problems that used to end in an exception -------------------------------------------------------------
 
 

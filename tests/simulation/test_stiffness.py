@@ -78,3 +78,13 @@ def test_where_eulers_steps_add_a_little_energy_the_exponential_scheme_takes_as_
 def test_bridges_of_modes_that_die_out_stay_near_their_ends():
     share = bridge_shares(np.array([[-8.0, 0.0], [0.0, -1e-9]]), np.eye(2), 0.5)
     np.testing.assert_allclose(share, [np.sqrt(np.tanh(2.0) / 2.0), 1.0], rtol=1e-6)
+
+
+def test_where_the_drift_is_undefined_at_the_start_nothing_is_said_of_steps():
+    system = cb.ContinuousSystem(lambda x: [np.sqrt(x[0] - 5.0)], states=1, diffusion=[[0.1]])
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1.0)
+    assert prepare(problem).model.scheme == "euler"
+
+
+def test_a_step_so_long_that_the_scheme_has_no_numbers_is_too_long():
+    assert step_error(SWING[None] * -1.0, 1e300, 1e300, -SWING) == np.inf

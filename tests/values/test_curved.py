@@ -288,6 +288,13 @@ def test_what_is_not_served_is_refused_in_words() -> None:
         exits.chart_exits(in_disc(), levels=[-1.0])
 
 
+def test_noise_that_is_infinite_somewhere_is_refused():
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=lambda x: [[1 / x[0], 0], [0, 1]])
+    problem = cb.Problem(system, initial=[0.1, 0.0], safe=[cb.Inside(cb.Ball([0, 0], 1.0))], horizon=1.0)
+    with pytest.raises(InfeasibleError, match="no finite size somewhere"):
+        bound_exits(problem, seconds=0.5)
+
+
 def test_a_certificate_that_cannot_state_a_curved_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = in_disc(horizon=0.5, noise=0.3)
     assert walled(problem)

@@ -42,6 +42,33 @@ class _Shape:
     outside: bool
     bound: arb | None = None
 
+    def keeps(self, centre: Sequence[arb], radius: Sequence[arb], *, strictly: bool = False) -> bool:
+        """Whether no point of a box breaks it; ``strictly``: nor touches an obstacle.
+
+        Boxes that touch an obstacle are left to the boxes that reach into it and have the same points; of one that may
+        have no interior there are none, and it must not be touched.
+        """
+        high = self.over(centre, radius)[1]
+        return bool(high < 0 or (high <= 0 and not (self.outside and (strictly or self._thin()))))
+
+    def _thin(self) -> bool:
+        """Whether the region was not shown to have an interior, as a ball, a half-space and a box of a volume have."""
+        if self.bound is not None:
+            return not self.bound > 0
+        if len(self.forms) == 1:
+            return False
+        low, high = dict[int, arb](), dict[int, arb]()
+        for form, offset in zip(self.forms, self.offsets):
+            if len(form) != 1:
+                return True
+            (j, factor), = form
+            end = offset / factor
+            if factor > 0:
+                high[j] = arb.min(high.get(j, end), end)
+            else:
+                low[j] = arb.max(low.get(j, end), end)
+        return not all(low[j] < high[j] for j in low.keys() & high.keys())
+
     def over(self, centre: Sequence[arb], radius: Sequence[arb]) -> tuple[arb, arb]:
         """Ends that enclose phi over a box."""
         ends = [_over(form, offset, centre, radius) for form, offset in zip(self.forms, self.offsets)]
@@ -94,8 +121,7 @@ class StepSet:
         """Whether no point of a box breaks a constraint; ``strictly``: an obstacle must not be touched either."""
         centre = [(a + b) / 2 for a, b in box]
         radius = [(b - a) / 2 for a, b in box]
-        ends = [(shape, shape.over(centre, radius)[1]) for shape in self._shapes]
-        return all(high < 0 or (high <= 0 and not (strictly and shape.outside)) for shape, high in ends)
+        return all(shape.keeps(centre, radius, strictly=strictly) for shape in self._shapes)
 
     def excludes(self, box: Sequence[Side]) -> bool:
         """Whether every point of a box breaks a constraint, the same one."""
@@ -175,9 +201,9 @@ class SafeSet:
         """Whether every point of a box surely breaks a constraint, the same one."""
         return any(shape.over(centre, radius)[0] > 0 for shape in self.shapes)
 
-    def holds(self, centre: Sequence[arb], radius: Sequence[arb]) -> bool:
-        """Whether no point of a box breaks a constraint."""
-        return all(shape.over(centre, radius)[1] <= 0 for shape in self.shapes)
+    def holds(self, centre: Sequence[arb], radius: Sequence[arb], *, strictly: bool = False) -> bool:
+        """Whether no point of a box breaks a constraint; ``strictly``: an obstacle must not be touched either."""
+        return all(shape.keeps(centre, radius, strictly=strictly) for shape in self.shapes)
 
     def contains(self, box: Sequence[Side], budget: Budget) -> bool:
         """Whether a box is proved to lie in the set, cut into parts where need be."""

@@ -287,12 +287,17 @@ class _Discrete:
         return self.grids[self.order[step]]
 
     def _zone(self, step: int) -> Zones:
-        """What is known of the cells at a step; the same at all steps where nothing moves or has a window."""
+        """What is known of the cells at a step; the same at all steps where nothing moves or has a window.
+
+        Noise in pieces may lead to a face of a cell more than rarely.
+        """
         asked = (*self.model.constraints, *([] if self.model.target is None else [self.model.target]))
         still = all(c.during is None and isinstance(c.region.center, list) for c in asked)
         key = (self.order[step], 0 if still else step)
         if key not in self._zones:
-            self._zones[key] = zones(self._grid(step), self.model, step, self.budget)
+            self._zones[key] = zones(
+                self._grid(step), self.model, step, self.budget, strictly=self.pieces is not None
+            )
         return self._zones[key]
 
 

@@ -18,6 +18,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,8 @@ class Transition:
         spreads = _deviations(steps.model)
         self._scales = [(float((1 / s).mid()), above(abs(1 / s - float((1 / s).mid())))) for s in spreads]
         self._spacing = [float(s.mid()) / PER_DEVIATION for s in spreads]
+        if not all(width > 0 and math.isfinite(scale) for width, (scale, _) in zip(self._spacing, self._scales)):
+            raise Unproved("the noise is too small for value functions in floats")
         points = [self._points(i, after.edges[i]) for i in range(self.n)]
         if np.prod([len(one) for one in points]) > _MOST_POINTS:
             raise Unproved(f"the mesh around the images would have more than {_MOST_POINTS} points")
@@ -298,8 +301,8 @@ class Zones:
     within: Mask
 
 
-def zones(grid: Grid, model: Model, step: int, budget: Budget) -> Zones:
-    """What is known of every cell."""
+def zones(grid: Grid, model: Model, step: int, budget: Budget, *, strictly: bool = False) -> Zones:
+    """What is known of every cell; ``strictly``: one that touches an obstacle is not safe."""
     low, high = grid.boxes()
     boxes = [[(arb(a), arb(b)) for a, b in zip(low[:, k], high[:, k])] for k in range(low.shape[1])]
     limits, domain = (model.constraints[:-1], model.constraints[-1:]) if model.ends else (model.constraints, ())
@@ -309,7 +312,8 @@ def zones(grid: Grid, model: Model, step: int, budget: Budget) -> Zones:
     if counts(model, step):
         target = StepSet(replace(model, constraints=(target_of(model),)), step, budget)
         done, undone = _decided(target.holds, boxes, budget), _decided(target.excludes, boxes, budget)
-    safe, unsafe = _decided(allowed.holds, boxes, budget), _decided(allowed.excludes, boxes, budget)
+    safe = _decided(partial(allowed.holds, strictly=strictly), boxes, budget)
+    unsafe = _decided(allowed.excludes, boxes, budget)
     return Zones(safe, unsafe, done, undone, _decided(inside.holds, boxes, budget))
 
 

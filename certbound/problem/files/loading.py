@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
@@ -74,7 +75,7 @@ def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Proble
     Errors are those of ``load``.
     """
     try:
-        content = tomllib.loads(text.removeprefix("\ufeff"))
+        content = tomllib.loads(text.removeprefix("\ufeff"), parse_float=_decimal)
     except tomllib.TOMLDecodeError as error:
         twice = "; a key or a table stands there twice" if "overwrite" in f"{error}" or "twice" in f"{error}" else ""
         raise ValueError(f"the problem file is not TOML: {error}{twice}.") from error
@@ -83,6 +84,14 @@ def loads(text: str, *, folder: Path | None = None, **parameters: Any) -> Proble
     if not content:
         raise ValueError("the problem file is empty; `certbound new NAME` writes one that works.")
     return _built(content, folder, parameters)
+
+
+def _decimal(written: str) -> float:
+    """A TOML number with a point or an exponent: one that is too large is not what ``inf`` says."""
+    value = float(written)
+    if math.isinf(value) and not written.endswith("inf"):
+        raise ValueError(f"the problem file must not hold {written[:40]}, which is too large; write inf for no end.")
+    return value
 
 
 def notes(source: str | Path) -> tuple[str, ...]:

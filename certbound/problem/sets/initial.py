@@ -22,6 +22,13 @@ def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside]) 
     for constraint in constraints:
         if constraint.during is not None and constraint.during[0] > 0:
             continue
+        with np.errstate(all="ignore"):
+            place = constraint.region.center_at()
+        if not np.all(np.isfinite(place)):
+            raise ValueError(
+                f"`safe` must have centres that are defined when their sets count, but that of '{constraint.label}' is "
+                f"{place.tolist()} at time 0; mend the centre, or give the set a later `during`."
+            )
         fault = _fault(initial, center, constraint)
         if fault:
             raise ValueError(

@@ -132,7 +132,9 @@ def _fine_enough(
     """The scheme and the steps, at most ``most``, that a model's fastest modes need; a warning where these are more."""
     horizon = float(problem.horizon)
     looks = jacobians(model, steps, start)
-    error = step_error(looks, horizon / steps, horizon) if len(looks) else 0.0
+    if not len(looks):  # undefined at the starts
+        return model, steps
+    error = step_error(looks, horizon / steps, horizon)
     choice = scenario.scheme == "auto" and model.spread is not None
     if error <= 1.0:
         better = choice and most > 0 and error > max(_ROUGH, step_error(looks, horizon / steps, horizon, looks[0]))

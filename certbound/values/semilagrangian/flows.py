@@ -232,5 +232,6 @@ def reachable(tape: Tape, start: Sequence[Interval], step: float, begin: Interva
 
 
 def _widened(value: Interval, good: Mask) -> Interval:
-    more = np.where(good, 0.08 * (value.hi - value.lo) + 1e-12 * (1 + value.mag), 0.0)
-    return Interval(value.lo - more, value.hi + more)
+    with np.errstate(over="ignore", invalid="ignore"):  # of boxes that run away
+        more = np.where(good, 0.08 * (value.hi - value.lo) + 1e-12 * (1 + value.mag), 0.0)
+        return Interval(value.lo - more, value.hi + more)

@@ -202,6 +202,7 @@ _COARSEST = (0.02, 2.5)  # cells along y over the width of the safe set, along q
 _GRADING = 0.12
 _BESIDE, _FINER = 1.5, 0.33  # deviations of q's noise beside an obstacle's end, and how much finer cells are there
 _SEEN = 1e-3  # a share of the visits that is worth fine cells
+_MOST_LINES = 200_000
 
 
 def axes_of(
@@ -279,6 +280,8 @@ def _outward(depths: Array, sigma: float, cell: float, beyond: float) -> Array:
 def _nodes(places: Array, widths: Array, least: int = 1) -> Array:
     """Nodes from the first place to the last at about these distances."""
     count = np.concatenate([[0.0], np.cumsum((1 / widths[1:] + 1 / widths[:-1]) / 2 * np.diff(places))])
+    if not count[-1] < _MOST_LINES:  # where paths stray within a step about as far as the safe set is wide, say
+        raise InfeasibleError(f"a grid would have more than {_MOST_LINES} lines; value functions prove nothing here.")
     nodes = np.interp(np.linspace(0, count[-1], max(least, math.ceil(count[-1])) + 1), count, places)
     nodes[0], nodes[-1] = places[0], places[-1]
     return np.asarray(nodes)

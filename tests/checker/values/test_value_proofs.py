@@ -588,3 +588,10 @@ def test_a_door_writes_what_the_checker_proves() -> None:
     report = check_data(data, json.loads(json.dumps(problem_data(problem))))
     assert report.valid, report.reason
     assert "for every disturbance in its set that does not see coming noise" in report.claim
+
+
+@pytest.mark.parametrize("std", [5e-324, 1e-310])
+def test_noise_that_is_too_small_for_floats_is_refused_in_words(std: float) -> None:
+    data = parse(text("valued"))
+    data["problem"]["noise"]["values"] = exact([std])
+    assert "the noise is too small" in check_data(data).reason

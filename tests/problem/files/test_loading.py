@@ -155,6 +155,7 @@ def test_a_thousand_chained_definitions_are_read():
         ("[noise]\n", "noise = 0.1\n[nois]\n", "unknown key|is wrong"),
         ("delta = 1e-3", "delta = 1e-3\nnoise = 0.1\n[junk]\n", "unknown key 'junk'|TOML"),
         ("time = ", "time == ", "the problem file is not TOML"),
+        ("delta = 1e-3", "delta = 1e-3\n[parameters]\nq = 1e400", "must not hold 1e400, which is too large; write inf"),
     ],
 )
 def test_faults_are_named(old, new, message):

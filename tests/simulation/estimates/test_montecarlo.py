@@ -92,6 +92,7 @@ def test_a_worse_problem_is_found_worse():
         ({"paths": float("nan")}, ValueError, "`paths` must be a positive whole number, got nan"),
         ({"paths": "many"}, TypeError, "`paths` must be a positive whole number, got 'many'"),
         ({"paths": True}, TypeError, "`paths` must be a positive whole number, got True"),
+        ({"paths": 1e15}, ValueError, r"`paths` must be at most 1e\+12, got 1e\+15"),
         ({"steps": 0}, ValueError, "`steps` must be a positive whole number, got 0"),
         ({"steps": 10**12}, ValueError, r"`steps` must be at most \d+ for this problem"),
         ({"confidence": 1.0}, ValueError, "`confidence` must lie in"),
@@ -193,3 +194,13 @@ def test_a_law_of_an_unknown_class_is_refused_not_taken_for_another(law):
         simulate_exits(problem, paths=100, rng=1)
     with pytest.raises(TypeError, match="to be written"):
         problem.to_dict()
+
+
+def test_a_step_beyond_where_the_noise_vanishes_as_a_root_goes_on():
+    """The slope of sqrt(max(x, 0)) is no number below 0, where there is no noise."""
+    system = cb.ContinuousSystem(
+        lambda x: 0.1 - x, states=1, diffusion=lambda x: [[np.sqrt(np.maximum(x[0], 0.0))]]
+    )
+    problem = cb.Problem(system, initial=[0.5], safe=[cb.Inside(cb.Box([-2], [3]))], horizon=1.0)
+    found = cb.simulate_exits(problem, paths=500, steps=200, rng=np.random.default_rng(0))
+    assert (found.exits, found.scheme) == (0, "milstein")

@@ -21,7 +21,7 @@ from certbound.values.semilagrangian import bands, landings
 from certbound.values.semilagrangian.backward import Bounds, back, limited
 from certbound.values.semilagrangian.bands import Band, Frame, through
 from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sheared
-from certbound.values.semilagrangian.groundwork import layouts_of
+from certbound.values.semilagrangian.groundwork import layouts_of, nodes_of
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import serves, setting_of
 from certbound.values.semilagrangian.remainders import bowed, level_of, remainders, upper_tail
@@ -409,6 +409,18 @@ def test_which_problems_are_served_and_what_the_others_are_told() -> None:
     problem = cb.Problem(lonely, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
     with pytest.raises(InfeasibleError, match="hardly reaches"):
         next(layouts_of(setting_of(problem), Plan(count=10, fine=0.7, wide=0.01, cell=0.35, spare=1e-7)))
+
+
+def test_a_grid_for_steps_that_are_too_long_for_the_safe_set_is_not_made():
+    """It would have had nodes at distances of 1e-12, and 35 TiB."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1] + 0.1 * x[1] ** 2, -1.2 * x[0] - 0.8 * x[1] + 0.4 * x[0] * x[1]], states=2,
+        diffusion=[[0], [0.56]],
+    )  # fmt: skip
+    box = cb.Box([-0.46, -1.27], [0.46, 1.27])
+    problem = cb.Problem(system, initial=[-0.1, 0.4], safe=[cb.Inside(box)], horizon=4.0)
+    with pytest.raises(InfeasibleError, match="more than 200000 lines"):
+        nodes_of(setting_of(problem), Plan(count=18, fine=0.7, wide=0.005, cell=0.3, spare=1e-9))
 
 
 def pendulum_of(unit: float):

@@ -90,8 +90,10 @@ class _ArrivingBelow(Crossing):
         return float(np.nextafter(low.min() + self.lift, -np.inf))
 
     def _harmless_sides(self) -> list[Side]:
-        target = _target(self.model)
-        return [(0, end) for end in (0, 1) if not target.holds(*_box(self, (0, end)))]
+        """Those that do not lie in the target, or touch an obstacle: who meets both at once has failed."""
+        sides, target, limits = [(0, 0), (0, 1)], _target(self.model), self.limits()
+        boxes = {side: _box(self, side) for side in sides}
+        return [s for s, box in boxes.items() if not (target.holds(*box) and limits.holds(*box, strictly=True))]
 
 
 class _ArrivingAbove(Passage):

@@ -165,6 +165,8 @@ def _refuse_noiseless(squares: Squares, region: Region, horizon: float) -> None:
     """The bound would hold, but no smooth V that is near the truth does."""
     points = np.meshgrid(*(np.linspace(low, high, 9) for low, high in zip(region.low, region.high)), indexing="ij")
     a = squares(horizon, *points) * np.ones((2, 2, 9, 9))
+    if not np.all(np.isfinite(a)):
+        raise InfeasibleError("the noise has no finite size somewhere in the safe set; value functions prove nothing.")
     if np.all(a[0, 0] * a[1, 1] - a[0, 1] ** 2 <= _RANK * (a[0, 0] + a[1, 1]) ** 2):
         raise InfeasibleError(
             "value functions within curved limits or among obstacles need noise of full rank; here some direction has "
