@@ -13,8 +13,10 @@ times as many calls. Functions of one variable (``composed``) are expanded by ba
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
@@ -39,12 +41,12 @@ _TINY = 1e-300
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The monomials of a total degree in some variables, and which products of two are kept."""
+    """The monomials of a total degree in some variables, and of each the products (j, k) with others that are kept."""
 
     variables: int
     degree: int
     exponents: tuple[tuple[int, ...], ...]
-    kept: tuple[tuple[int, int, int], ...]
+    kept: tuple[tuple[tuple[int, int], ...], ...]
     totals: tuple[int, ...]
 
 
@@ -60,12 +62,12 @@ def terms(variables: int, degree: int) -> Terms:
     every = [a for a in itertools.product(range(degree + 1), repeat=variables) if sum(a) <= degree]
     exponents = tuple(sorted(every, key=lambda a: (sum(a), [-x for x in a])))
     place = {a: k for k, a in enumerate(exponents)}
+    totals = tuple(sum(a) for a in exponents)
     kept = []
-    for (i, a), (j, b) in itertools.product(enumerate(exponents), repeat=2):
-        k = place.get(tuple(x + y for x, y in zip(a, b)))
-        if k is not None:
-            kept.append((i, j, k))
-    return Terms(variables, degree, exponents, tuple(kept), tuple(sum(a) for a in exponents))
+    for a, total in zip(exponents, totals):
+        others = exponents[: bisect.bisect_right(totals, degree - total)]
+        kept.append(tuple((j, place[tuple(map(operator.add, a, b))]) for j, b in enumerate(others)))
+    return Terms(variables, degree, exponents, tuple(kept), totals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +100,17 @@ class Batch:
         """x -> x times this: `mul` by one factor again and again, which is looked at once."""
         which = self.terms
         yours, two = self._parts()
-        right = two.sum(axis=0)
+        right, rows = two.sum(axis=0), list(self.coefficients)
 
         def product(x: Batch) -> Batch:
             mine, one = (yours, two) if x is self else x._parts()
             coefficients = np.zeros_like(x.coefficients)
-            for i, j, k in which.kept:
-                if mine[i] and yours[j]:
-                    coefficients[k] += x.coefficients[i] * self.coefficients[j]
+            into = list(coefficients)
+            for i, own in enumerate(x.coefficients):
+                if mine[i]:
+                    for j, k in which.kept[i]:
+                        if yours[j]:
+                            into[k] += own * rows[j]
             lost = np.zeros_like(x.error)
             for a in range(1, which.degree + 1):
                 for b in range(which.degree + 1 - a, which.degree + 1):
