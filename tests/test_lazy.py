@@ -19,8 +19,11 @@ def _summed(x: np.ndarray) -> float:
     return total
 
 
+IMPORTED = (_summed, _once)  # as another module has them
+
+
 def test_a_module_is_compiled_when_one_of_its_functions_is_called():
-    given, other = _summed, _once  # as another module imports them
+    given, other = IMPORTED
     assert isinstance(given, compiled)
     assert other.__doc__ == "A number and a half."
     assert given(np.array([1.0, 3.0])) == 6.0
