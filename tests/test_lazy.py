@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from certbound.lazy import compiled
+from certbound.lazy import compiled, within
 
 
 @compiled
@@ -19,11 +19,31 @@ def _summed(x: np.ndarray) -> float:
     return total
 
 
+IMPORTED = (_summed, _once)  # as another module has them
+
+
 def test_a_module_is_compiled_when_one_of_its_functions_is_called():
-    given, other = _summed, _once  # as another module imports them
+    given, other = IMPORTED
     assert isinstance(given, compiled)
     assert other.__doc__ == "A number and a half."
     assert given(np.array([1.0, 3.0])) == 6.0
     assert given(np.arange(3)) == 4.5
     assert other.kernel is _once is globals()["_once"]
     assert len(given.kernel.nopython_signatures) == 2
+
+
+@within
+def _halved(x: float) -> float:
+    return 0.5 * x
+
+
+@compiled
+def _half_of(x: float) -> float:
+    return _halved(x)
+
+
+def test_what_only_compiled_functions_call_has_no_way_in_from_python():
+    assert _half_of(3.0) == 1.5
+    assert [one.targetoptions["no_cpython_wrapper"] for one in (_half_of, _halved)] == [False, True]
+    assert _half_of.targetoptions["no_cfunc_wrapper"]
+    assert _halved.targetoptions["no_cfunc_wrapper"]

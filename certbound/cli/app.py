@@ -5,12 +5,13 @@ from __future__ import annotations
 import _thread
 import contextlib
 import difflib
+import functools
 import logging
 import re
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -98,11 +99,17 @@ def interruptible() -> Iterator[list[BaseException]]:
         sys.unraisablehook = told
 
 
+@functools.cache
+def _command() -> Any:
+    """The commands with their options, read from their functions once."""
+    return typer.main.get_command(app)
+
+
 def _run(words: list[str], command: str) -> int:
     lost: list[BaseException] = []
     try:
         with interruptible() as lost:
-            code = app(args=words, prog_name="certbound", standalone_mode=False)
+            code = _command()(args=words, prog_name="certbound", standalone_mode=False)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED

@@ -69,8 +69,8 @@ def corners(nodal: Array) -> list[Array]:
 def over_corners(pick: np.ufunc, nodal: Array) -> Array:
     """The largest (``np.maximum``) or smallest (``np.minimum``) corner of every cell."""
     for axis in range(nodal.ndim):
-        moved = np.moveaxis(nodal, axis, 0)
-        nodal = np.moveaxis(pick(moved[:-1], moved[1:]), 0, axis)
+        before = (slice(None),) * axis
+        nodal = pick(nodal[(*before, slice(None, -1))], nodal[(*before, slice(1, None))])
     return nodal
 
 

@@ -13,8 +13,10 @@ times as many calls. Functions of one variable (``composed``) are expanded by ba
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
@@ -39,12 +41,12 @@ _TINY = 1e-300
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The monomials of a total degree in some variables, and which products of two are kept."""
+    """The monomials of a total degree in some variables, and of each the products (j, k) with others that are kept."""
 
     variables: int
     degree: int
     exponents: tuple[tuple[int, ...], ...]
-    kept: tuple[tuple[int, int, int], ...]
+    kept: tuple[tuple[tuple[int, int], ...], ...]
     totals: tuple[int, ...]
 
 
@@ -60,12 +62,12 @@ def terms(variables: int, degree: int) -> Terms:
     every = [a for a in itertools.product(range(degree + 1), repeat=variables) if sum(a) <= degree]
     exponents = tuple(sorted(every, key=lambda a: (sum(a), [-x for x in a])))
     place = {a: k for k, a in enumerate(exponents)}
+    totals = tuple(sum(a) for a in exponents)
     kept = []
-    for (i, a), (j, b) in itertools.product(enumerate(exponents), repeat=2):
-        k = place.get(tuple(x + y for x, y in zip(a, b)))
-        if k is not None:
-            kept.append((i, j, k))
-    return Terms(variables, degree, exponents, tuple(kept), tuple(sum(a) for a in exponents))
+    for a, total in zip(exponents, totals):
+        others = exponents[: bisect.bisect_right(totals, degree - total)]
+        kept.append(tuple((j, place[tuple(map(operator.add, a, b))]) for j, b in enumerate(others)))
+    return Terms(variables, degree, exponents, tuple(kept), totals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +85,42 @@ class Batch:
 
     def sizes(self) -> Array:
         """Sums of the absolute coefficients of every total degree, shape (degree + 1, N)."""
+        return self._parts()[1]
+
+    def _parts(self) -> tuple[list[bool], Array]:
+        """Which coefficients are not 0 everywhere, and the `sizes`."""
+        present = np.any(self.coefficients, axis=1).tolist()
         found = np.zeros((self.terms.degree + 1, len(self.error)))
         for k, total in enumerate(self.terms.totals):
-            found[total] += np.abs(self.coefficients[k])
-        return found
+            if present[k]:
+                found[total] += np.abs(self.coefficients[k])
+        return present, found
+
+    def times(self) -> Callable[[Batch], Batch]:
+        """x -> x times this: `mul` by one factor again and again, which is looked at once."""
+        which = self.terms
+        yours, two = self._parts()
+        right, rows = two.sum(axis=0), list(self.coefficients)
+
+        def product(x: Batch) -> Batch:
+            mine, one = (yours, two) if x is self else x._parts()
+            coefficients = np.zeros_like(x.coefficients)
+            into = list(coefficients)
+            for i, own in enumerate(x.coefficients):
+                if mine[i]:
+                    for j, k in which.kept[i]:
+                        if yours[j]:
+                            into[k] += own * rows[j]
+            lost = np.zeros_like(x.error)
+            for a in range(1, which.degree + 1):
+                for b in range(which.degree + 1 - a, which.degree + 1):
+                    lost += one[a] * two[b]
+            left = one.sum(axis=0)
+            rounding = (len(which.exponents) + 2) * _UNIT * left * right
+            error = lost + rounding + x.error * (right + self.error) + self.error * left + _TINY
+            return known(Batch(which, coefficients, error * _UP))
+
+        return product
 
     def reach(self) -> Array:
         """At least the distance of every value from the constant term."""
@@ -203,21 +237,7 @@ def scaled(x: Batch, factor: Array | float, off: Array | float = 0.0) -> Batch:
 
 def mul(x: Batch, y: Batch) -> Batch:
     """x y, without the terms beyond the degree, which lie in the error."""
-    which = x.terms
-    coefficients = np.zeros_like(x.coefficients)
-    mine, yours = (list(np.any(z.coefficients, axis=1)) for z in (x, y))
-    for i, j, k in which.kept:
-        if mine[i] and yours[j]:
-            coefficients[k] += x.coefficients[i] * y.coefficients[j]
-    one, two = x.sizes(), y.sizes()
-    lost = np.zeros_like(x.error)
-    for a in range(1, which.degree + 1):
-        for b in range(which.degree + 1 - a, which.degree + 1):
-            lost += one[a] * two[b]
-    left, right = one.sum(axis=0), two.sum(axis=0)
-    rounding = (len(which.exponents) + 2) * _UNIT * left * right
-    error = lost + rounding + x.error * (right + y.error) + y.error * left + _TINY
-    return known(Batch(which, coefficients, error * _UP))
+    return y.times()(x)
 
 
 def composed(x: Batch, function: Callable[[Series], Series]) -> Batch:
@@ -231,9 +251,9 @@ def composed(x: Batch, function: Callable[[Series], Series]) -> Batch:
     table = np.array([_expanded(function, float(v), float(r), order) for v, r in pairs]).reshape(-1, order + 2)
     found = table[back.reshape(-1)].T
     rest = Batch(x.terms, np.concatenate([np.zeros((1, len(reach))), x.coefficients[1:]]), x.error)
-    total = fixed(x.terms, found[order])
+    total, times = fixed(x.terms, found[order]), rest.times()
     for k in reversed(range(order)):
-        total = add(mul(total, rest), fixed(x.terms, found[k]))
+        total = add(times(total), fixed(x.terms, found[k]))
     return known(Batch(x.terms, total.coefficients, (total.error + found[order + 1]) * _UP))
 
 

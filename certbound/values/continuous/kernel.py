@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from certbound.arrays import Array, Index
-from certbound.lazy import compiled
+from certbound.lazy import compiled, within
 
 BLOCK = 16
 """Patches that are worked on together, side by side in the last axis: the processor's vectors run along it."""
@@ -67,7 +67,7 @@ def bernstein_in_plane(
                 reference[patch], size[patch] = base, most
 
 
-@compiled
+@within
 def _along(table: Array, matrix: Array, out: Array) -> None:
     """A matrix along the second axis of ``table``, shape (p, k, q), written to ``out``, (p, rows, q).
 
@@ -86,7 +86,7 @@ def _along(table: Array, matrix: Array, out: Array) -> None:
                     out[i, c, q] += matrix[c, terms - 1] * table[i, terms - 1, q]
 
 
-@compiled
+@within
 def _change(table: Array, first: Array, second: Array, third: Array, one: Array, two: Array, out: Array) -> None:
     """A matrix along each of the first three axes of ``table``, written to ``out``; ``one`` and ``two`` are buffers."""
     p, q, r, a, b, c = table.shape[0], table.shape[1], table.shape[2], len(first), len(second), len(third)
@@ -96,7 +96,7 @@ def _change(table: Array, first: Array, second: Array, third: Array, one: Array,
     _along(high.reshape(1, p, b * c * BLOCK), first, out.reshape(1, a, b * c * BLOCK))
 
 
-@compiled
+@within
 def _extreme(table: Array, low: Array, high: Array) -> None:
     """Least and largest entry for each patch of the block."""
     for s in range(BLOCK):
@@ -109,7 +109,7 @@ def _extreme(table: Array, low: Array, high: Array) -> None:
                     high[s] = max(high[s], table[i, j, k, s])
 
 
-@compiled
+@within
 def _extreme_parts(
     table: Array, parts: tuple[Array, ...], one: Array, two: Array, result: Array, low: Array, high: Array
 ) -> None:
@@ -206,7 +206,7 @@ def extremes_in_plane(
                 out[begin + s, branch, 2], out[begin + s, branch, 5] = low[s], max(-least[s], most[s])
 
 
-@compiled
+@within
 def _side_by_side(samples: Array, cells: Index, factors: Array, out: Array) -> None:
     """The samples (cells, x, y) of a block's patches, each times its factor, side by side in the last axis."""
     for s in range(BLOCK):
@@ -217,7 +217,7 @@ def _side_by_side(samples: Array, cells: Index, factors: Array, out: Array) -> N
                 q += BLOCK
 
 
-@compiled
+@within
 def _rest(
     slopes: tuple[Array, ...], bends: tuple[Array, ...], own: Array, rate: Array, straight: bool, energy: Array,
     rest: Array,

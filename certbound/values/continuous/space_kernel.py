@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from certbound.arrays import Array, Index
-from certbound.lazy import compiled
+from certbound.lazy import compiled, within
 
 BLOCK = 8
 """Patches that are worked on together."""
 
 
-@compiled
+@within
 def _contract(matrix: Array, table: Array, before: int | np.intp, after: int | np.intp, out: Array) -> None:
     """A matrix along the middle one of three axes, of lengths ``before``, its columns (4 or more) and ``after``.
 
@@ -51,7 +51,7 @@ def _contract(matrix: Array, table: Array, before: int | np.intp, after: int | n
             k += 1
 
 
-@compiled
+@within
 def _extreme(table: Array, count: int, low: Array, high: Array) -> None:
     """Least and largest of ``count`` entries for each patch of the block."""
     for s in range(BLOCK):
@@ -62,7 +62,7 @@ def _extreme(table: Array, count: int, low: Array, high: Array) -> None:
             high[s] = max(high[s], table[i * BLOCK + s])
 
 
-@compiled
+@within
 def _extreme_parts(
     table: Array, parts: tuple[Array, Array, Array, Array], work: tuple[Array, Array, Array, Array], low: Array,
     high: Array,
@@ -89,7 +89,7 @@ def _extreme_parts(
                         low[s], high[s] = min(low[s], least[s]), max(high[s], most[s])
 
 
-@compiled
+@within
 def _derivatives(
     c: Array, rate: Array, axes: tuple[Array, ...], mixed: bool, work: tuple[Array, ...], out: Array
 ) -> None:
@@ -124,7 +124,7 @@ def _derivatives(
     _contract(x0, yy, one, wide, out[6])
 
 
-@compiled
+@within
 def _gathered(
     table: Array, output: int, cells: Index, sample: int, factor: float, one: Array, two: Array, out: Array
 ) -> None:
@@ -138,7 +138,7 @@ def _gathered(
             out[p * BLOCK + s] = table[output, cells[s], own, p] * scale
 
 
-@compiled
+@within
 def _residual(v: Array, drift: Array, square: Array, mixed: bool, out: Array, energy: Array) -> None:
     """R for every branch (a row of ``out``; ``drift`` has three for each) and Q2 at the samples of space, flat."""
     vt, vx, vy, vz, xx, yy, zz = v[0], v[1], v[2], v[3], v[4], v[5], v[6]
@@ -157,7 +157,7 @@ def _residual(v: Array, drift: Array, square: Array, mixed: bool, out: Array, en
             own[p] = vt[p] + energy[p] + (fx[p] * vx[p] + fy[p] * vy[p] + fz[p] * vz[p])
 
 
-@compiled
+@within
 def _model(
     drift: Array, square: Array, cells: Index, sample: int, sides: Array, mixed: bool, force: Array, spread: Array
 ) -> None:

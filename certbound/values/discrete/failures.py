@@ -179,6 +179,7 @@ class Work:
         self.start_shocks = self._start_shocks()
         self._last: tuple[object, AnyTransition] | None = None
         self._lengths: dict[int, list[tuple[Array, Array]]] = {}
+        self._starts: dict[float, Grid] = {}
 
     def check_first(self, nodes: int, seconds: float) -> None:
         """Refuse a first grid that would take several times the ``seconds`` that may be spent."""
@@ -296,7 +297,7 @@ class Work:
 
     def _kept_transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         """The transition of a step, the same one as long as nothing changes."""
-        key = (id(grid), id(after), 0 if self.dynamics.steady else t)
+        key = (grid, after, 0 if self.dynamics.steady else t)
         if self._last is None or self._last[0] != key:
             self._last = key, self.transition(t, grid, after, share)
         return self._last[1]
@@ -354,13 +355,12 @@ class Work:
         """Largest value over the initial set, on a grid of its own."""
         region = self._start_region()
         tops, bottoms = (one if isinstance(one, tuple) else (one,) for one in (above, below))
-        grid = self._start_grid(region, share)
+        grid = self._starts.setdefault(share, self._start_grid(region, share))
         cells = grid.cells()
         stays = self.target if self.until is not None and self.since == 0 else None
         if stays is not None and not contains(stays, cells, 0)[1].all():
             raise Inapplicable("value functions take no start in a target that is to be stayed in from then on.")
-        meets = ~contains(region, cells, 0)[1]
-        safe, _ = respected(active_at(self.limits, 0), cells, 0)
+        meets, (safe, _) = ~contains(region, cells, 0)[1], respected(active_at(self.limits, 0), cells, 0)
         if self.ending is not None:
             meets &= ~(contains(self.ending, cells, 0)[0] & safe)
         if not meets.any():
@@ -368,8 +368,8 @@ class Work:
         if not np.all(safe[meets]):
             upper = 1.0
         else:
-            upper = self._highest(self.transition(0, grid, tops[0].grid, share), tops, meets)
-        transition = self.transition(0, grid, bottoms[0].grid, share)
+            upper = self._highest(self._kept_transition(0, grid, tops[0].grid, share), tops, meets)
+        transition = self._kept_transition(0, grid, bottoms[0].grid, share)
         values = np.maximum.reduce(nodes_below(transition, *bottoms, order=0))
         inside = contains(region, Interval.point(grid.nodes()), 0)[0]
         if self.ending is not None:

@@ -257,9 +257,10 @@ class Transition:
         low, high = cell_ranges(table, close, near * (1 + 1e-9), beyond * field.largest * (1 + 1e-9))
         for i in range(self.n):
             for end in (0, -1):
-                more = (ends[i, 0] * np.moveaxis(close, i, 0)[end] + ends[i, 1] * field.largest) * (1 + 1e-9)
-                np.moveaxis(low, i, 0)[end] -= more
-                np.moveaxis(high, i, 0)[end] += more
+                side = (*(slice(None),) * i, end)
+                more = (ends[i, 0] * close[side] + ends[i, 1] * field.largest) * (1 + 1e-9)
+                low[side] -= more
+                high[side] += more
         return low, high
 
     def _fourth(self, alpha: Alpha, i: int) -> tuple[float, float]:

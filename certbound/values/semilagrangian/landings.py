@@ -15,10 +15,10 @@ from __future__ import annotations
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.lazy import compiled
+from certbound.lazy import compiled, within
 
 
-@compiled
+@within
 def _cell_of(axis: Array, place: float) -> int:
     low, high = 0, len(axis) - 2
     while low < high:
@@ -30,7 +30,7 @@ def _cell_of(axis: Array, place: float) -> int:
     return low
 
 
-@compiled
+@within
 def _density(window: Index, tables: Array, rates: Array, bend: Array, share: float) -> float:
     """sup of the density over a window; ``tables`` cross_low, cross_high, steep_y, steep_w; ``rates`` y_t, w_t ranges.
 
@@ -53,7 +53,7 @@ def _density(window: Index, tables: Array, rates: Array, bend: Array, share: flo
     return best
 
 
-@compiled
+@within
 def _mean_bent(
     window: Index, q: Array, ends: tuple[float, float], loose: float, rates: Array, sagging: Array, sway: Array
 ) -> float:
@@ -85,7 +85,7 @@ def _mean_bent(
     return float((first + last) / 2 + abs(last - first) / 6)
 
 
-@compiled
+@within
 def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
     """Upper bound of the sum of the kinks that a path of that length in y crosses within a window."""
     total, largest, least = 0.0, 0.0, np.inf
@@ -101,7 +101,7 @@ def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
     return float(min(total, largest * (1 + np.floor(longest / least * 1.000001))))
 
 
-@compiled
+@within
 def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array) -> float:
     """What kinks that a path crosses lift it above its chord: |y_t| tau (1 - tau) times each, tau where it does.
 
@@ -130,7 +130,7 @@ def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array
     return float(min(0.25 * whole, longest * total))
 
 
-@compiled
+@within
 def _window(mesh: Array, q: Array, y0: float, y1: float, w0: float, w1: float) -> Index:
     found = np.empty(4, dtype=np.intp)
     found[0], found[1] = _cell_of(mesh, y0), _cell_of(mesh, y1)
@@ -262,7 +262,7 @@ def over_cells(
     return found
 
 
-@compiled
+@within
 def _largest(window: Index, table: Array) -> float:
     best = -np.inf
     for k in range(window[0], window[1] + 1):

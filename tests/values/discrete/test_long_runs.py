@@ -8,7 +8,7 @@ from scipy.special import ndtr
 
 import certbound as cb
 from certbound.errors import InfeasibleError
-from certbound.values.discrete import bound_failure, bound_long_run, long_runs
+from certbound.values.discrete import bound_failure, bound_long_run, failures, long_runs
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.long_runs import largest_rate, least_rate
 from certbound.values.grids import Grid
@@ -46,6 +46,18 @@ def test_a_thousand_million_steps_cost_what_a_hundred_thousand_cost():
     short, long = (bound_long_run(contraction(0.1, horizon=steps), seconds=0.3) for steps in (10**5, 10**9))
     assert short.before[0] == long.before[0] < 5000
     assert long.upper > short.upper
+
+
+def test_what_starts_see_of_a_step_is_prepared_once_a_grid(monkeypatch):
+    made, plain = [], failures.Work.transition
+
+    def counted(work, t, grid, after, share):
+        made.append(share)
+        return plain(work, t, grid, after, share)
+
+    monkeypatch.setattr(failures.Work, "transition", counted)
+    bound_long_run(contraction(), seconds=0.3)
+    assert all(made.count(share) == 2 for share in made)  # between cells, and from the starts
 
 
 def test_for_ever_noise_leaves_at_a_rate():

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
-from certbound.lazy import compiled
+from certbound.lazy import compiled, within
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -82,7 +82,7 @@ def _over_others(part: Array, axis: int) -> Array:
     return part
 
 
-@compiled
+@within
 def _cell_of(axis: Array, place: float) -> int:
     low, high = 0, len(axis) - 2
     while low < high:
@@ -159,7 +159,7 @@ def _running(field: Array, first: Index, last: Index) -> Array:
     return found
 
 
-@compiled
+@within
 def _largest(field: Array, window: Index) -> float:
     best = 0.0
     for m in range(window[0], window[1] + 1):
@@ -169,7 +169,7 @@ def _largest(field: Array, window: Index) -> float:
     return best
 
 
-@compiled
+@within
 def _at_plane(field: Array, window: Index, axis: int, plane: int) -> float:
     """Largest kink at a plane across a window."""
     part = np.empty(6, dtype=np.intp)
@@ -178,7 +178,7 @@ def _at_plane(field: Array, window: Index, axis: int, plane: int) -> float:
     return _largest(field, part)
 
 
-@compiled
+@within
 def _hump(low: float, high: float) -> float:
     """max of tau (1 - tau) over [low, high] and [0, 1]."""
     if low <= 0.5 <= high:
@@ -187,7 +187,7 @@ def _hump(low: float, high: float) -> float:
     return max(end * (1 - end), 0.0)
 
 
-@compiled
+@within
 def _excess(
     axis: int, start: Array, end: Array, rate: Array, bow: Array, window: Index, x: Array, y: Array, q: Array,
     slopes: Array, crosses: Array, down: Array,
@@ -226,7 +226,7 @@ def _excess(
     return float(total + crosses[2] * moving[1] * moving[2] / 4)
 
 
-@compiled
+@within
 def _ends(values: Array, found: Array) -> None:
     """Write the least and the largest of ``values`` to the first two of ``found``; what is no number stays so."""
     least, most = values[0], values[0]
@@ -238,7 +238,7 @@ def _ends(values: Array, found: Array) -> None:
     found[0], found[1] = least, most
 
 
-@compiled
+@within
 def _sides(part: Array, axis: int, low: Array, high: Array) -> None:
     """Fill ``low`` and ``high`` with the corners at the two ends of an axis."""
     for one in range(2):

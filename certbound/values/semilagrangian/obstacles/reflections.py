@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.lazy import compiled
+from certbound.lazy import compiled, within
 from certbound.rigor.intervals import Interval
 
 _PIECES, _FEW, _RARELY = 8, 3, 1e-5  # pieces, and how many where hardly any path is
@@ -129,12 +129,12 @@ def _bent(motion: Motion, side: str, sign: float) -> Array:
     return np.asarray(np.maximum(first + second, 0.0) * max(1.0, math.exp(-4 * k * h)) / motion.s**4)
 
 
-@compiled
+@within
 def _below(z: float) -> float:
     return 0.5 * math.erfc(-z / math.sqrt(2.0))
 
 
-@compiled
+@within
 def _joint(
     a: float, m: float, tau: float, last: float, x: float, absent: tuple[float, float, float], upper: bool
 ) -> float:
@@ -182,12 +182,12 @@ def _joint(
     return float(total)
 
 
-@compiled
+@within
 def _density(z: float) -> float:
     return math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
 
 
-@compiled
+@within
 def _early(low: float, gap: float, lean: float, loose: float) -> float:
     """P(xi > low, xi lean + N(0, loose^2) <= -gap), from above."""
     top = max(low, 0.0) + _FAR
