@@ -37,7 +37,8 @@ Ends = tuple[float, float]
 QUICK = ("double well 0.5", "linear 0.4", "Van der Pol 0.3", "logistic map, std .06", "pendulum, std .15")
 PATHS = 200_000
 ABOUT = {
-    "Van der Pol 0.2": 1.14e-4, "Van der Pol 0.3": 0.0343, "Lotka-Volterra 0.1": 7.3e-5, "Lotka-Volterra 0.2": 0.0934
+    "Van der Pol 0.1": 1.57e-17, "Van der Pol 0.2": 1.14e-4, "Van der Pol 0.3": 0.0343, "Lotka-Volterra 0.1": 7.3e-5,
+    "Lotka-Volterra 0.2": 0.0934, "pendulum, std .06": 2.2e-7, "three rooms, 100 steps": 6.7e-4,
 }  # fmt: skip
 RARE = 1e-3
 
@@ -152,7 +153,7 @@ CASES: tuple[Case, ...] = (
     Case(name="Lorenz-like", problem=lorenz, truth="paths", upper=5.0, lower=None),
     Case(name="unicycle", problem=unicycle, truth="paths", upper=2.0, lower=None),
     Case(name="cube", problem=cube, truth="paths", upper=1.5, lower=None),
-    *(Case(name=name, problem=make, truth="paths", upper=1.1, lower=1.1)
+    *(Case(name=name, problem=make, truth="paths", upper=1.1, lower=1.1, about=ABOUT.get(name))
       for name, make in values_discrete.PROBLEMS.items()),
 )  # fmt: skip
 

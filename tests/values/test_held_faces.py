@@ -15,8 +15,8 @@ from certbound.values.continuous import bound_exits, exits, is_confined
 from certbound.values.continuous.coefficients import enclose
 from certbound.values.continuous.held_faces import held_face, rarely_reached, resolved
 from certbound.values.continuous.payment import Payment, Terms
-from certbound.values.continuous.plane import held_plane, released, two_sides
-from certbound.values.continuous.plane.two_sides import plane_of, with_rare
+from certbound.values.continuous.plane import held_plane, plane_of, released, two_sides
+from certbound.values.continuous.plane.two_sides import with_rare
 
 
 def line(f, g, safe, *, start=0.5, horizon=2.0, states=("x",)):

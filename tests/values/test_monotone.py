@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import types
 
 import numpy as np
+import pytest
 
 import certbound as cb
 from certbound.values.continuous import exits
@@ -16,6 +18,7 @@ from certbound.values.continuous.plane.monotone import propose_monotone
 from certbound.values.continuous.plane.plane_grids import Plan, Plane
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.room import safe_room, starts_of
+from certbound.values.continuous.surface import Surface
 
 
 def seen(problem: cb.Problem) -> tuple[Model, Plane]:
@@ -72,3 +75,48 @@ def test_noise_that_is_shared_by_both_states_is_served() -> None:
     surface = two_sides._promising(plane, model, Plan(cells=12, growth=0.5, lead=0.05))
     assert surface is not None
     assert 0.217 < math.exp(prove_upper(surface, model, plane.starts).log) < 0.4  # 0.2176 of 200,000 paths
+
+
+def test_eps_pays_for_a_residual_where_v_is_highest_on_a_patch() -> None:
+    """V falls by 20 from side to side of a cell: where it is high there is nothing that eps could pay of R = 2.5."""
+    system = cb.ContinuousSystem(lambda x: [0.02 + 0 * x[0], 0 * x[1]], states=2, diffusion=0.01 * np.eye(2))
+    model, plane = seen(cb.Problem(system, initial=[0.5, 0.5], safe=[cb.Inside(cb.Box([0, 0], [1, 1]))], horizon=1))
+    axis = np.linspace(0.0, 1.0, 6)
+    values = np.zeros((2, 6, 3, 6, 3))
+    values[:, :, 0, :, 0], values[:, :, 1, :, 0] = 100 * (axis[:, None] - 1), 100.0
+    flat = np.zeros((1, 6, 3, 6, 3))
+    surface = Surface(axes=(axis, axis), times=np.array([0.0, 1.0]), values=values, start_rates=flat, end_rates=flat)
+    excess = two_sides.Sketch.of(surface, model, plane.starts, level=-50.0).excess
+    assert np.all(excess[:, 2:] > 2.4)
+    assert np.all(excess[:, 0] == 0)
+
+
+def test_what_promises_nothing_beside_another_way_is_not_asked_on_the_next_grid(monkeypatch) -> None:
+    model, plane = seen(decaying((1.0, 2.0), np.diag([0.6, 0.7])))
+    plan, asked = Plan(cells=10, growth=0.8, lead=0.05), list[str]()
+    surface = propose_monotone(plane, plan, None, 0.6)
+    promised = {"far": (-9.0, -8.0), "vain": (-9.5, 3.0), "near": (-8.9, -8.5)}
+
+    def refined(_plane, _model, _plan, _level, propose, _tops):
+        asked.append(propose)
+        start, estimate = promised[propose]
+        return types.SimpleNamespace(start=start, estimate=lambda: estimate, surface=surface)
+
+    monkeypatch.setattr(two_sides, "_refined", refined)
+    kinds = ["far", "vain", "near"]
+    for _ in range(2):
+        two_sides._promising(plane, model, plan, kinds=kinds)
+    assert asked == ["far", "vain", "near", "far", "near"]
+    alone = ["vain"]
+    assert two_sides._promising(plane, model, plan, kinds=alone) is None
+    assert alone == ["vain"]
+
+
+@pytest.mark.slow
+def test_the_reversed_van_der_pol_oscillator_where_leaving_has_a_probability_of_1e_17() -> None:
+    """The truth is 1.573e-17: differences of order 4 of log u on 360^2 and 480^2 cells."""
+    system = cb.ContinuousSystem(lambda x: [-x[1], x[0] + (x[0] ** 2 - 1) * x[1]], states=2, diffusion=0.1 * np.eye(2))
+    safe = [cb.Inside(cb.Box([-1.2, -1.2], [1.2, 1.2]))]
+    problem = cb.Problem(system, initial=cb.Box([-0.2, -0.2], [0.2, 0.2]), safe=safe, horizon=5)
+    found = exits.bound_exits(problem, seconds=20, delta=1.6e-17)
+    assert 1.57e-17 < 10**found.upper < 1.6e-16

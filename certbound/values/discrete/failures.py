@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -59,6 +60,7 @@ _NODE_SECONDS = {False: 1e-4, True: 2e-3}
 """Roughly what a node of a first grid takes, without and with a common factor in the noise; measured, for refusing."""
 _PATIENCE = 1.0  # seconds for which grids are refined although the question is answered
 _CHARTED = 300_000  # parts of cells that a map has at most
+_APART = 20_000  # cells from which on both sides are worth two threads
 _FLOOR = 1e-16  # where what lies beyond ten standard deviations begins to count
 
 
@@ -265,11 +267,16 @@ class Work:
         above = final(grids[last], zones[last], above=True, beyond=self.beyond)
         below = final(grids[last], zones[last], above=False, beyond=self.beyond_below)
         yield last, above, below
-        for t in range(last - 1, end - 1, -1):
-            poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
-            step = self._kept_transition(t, grids[t], grids[t + 1], share)
-            above, below = back_above(step, above, zones[t]), back_below(step, below, zones[t])
-            yield t, above, below
+        with ThreadPoolExecutor(1) as beside:  # one side on another core: neither knows of the other
+            for t in range(last - 1, end - 1, -1):
+                poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
+                before, step = self._last, self._kept_transition(t, grids[t], grids[t + 1], share)
+                if before is self._last and math.prod(grids[t].shape) >= _APART and self.shocks.sizes is None:
+                    other = beside.submit(back_below, step, below, zones[t])
+                    above, below = back_above(step, above, zones[t]), other.result()
+                else:  # what a step keeps for later is made by one thread
+                    above, below = back_above(step, above, zones[t]), back_below(step, below, zones[t])
+                yield t, above, below
 
     def _staying(self, grids: list[Grid], share: float, end: int, until: int) -> tuple[Parts, Parts]:
         """Functions above and below at step ``end`` where the target, if met until a step, must be stayed in."""
@@ -353,7 +360,8 @@ class Work:
         self, above: ValueFunction | Parts, below: ValueFunction | Parts, share: float
     ) -> tuple[float, float]:
         """Largest value over the initial set, on a grid of its own."""
-        region = self._start_region()
+        initial = self.problem.initial
+        region = Box(initial.mean, initial.mean) if initial.random else initial
         tops, bottoms = (one if isinstance(one, tuple) else (one,) for one in (above, below))
         grid = self._starts.setdefault(share, self._start_grid(region, share))
         cells = grid.cells()
@@ -365,17 +373,13 @@ class Work:
             meets &= ~(contains(self.ending, cells, 0)[0] & safe)
         if not meets.any():
             return 0.0, 0.0
-        if not np.all(safe[meets]):
-            upper = 1.0
-        else:
-            upper = self._highest(self._kept_transition(0, grid, tops[0].grid, share), tops, meets)
-        transition = self._kept_transition(0, grid, bottoms[0].grid, share)
-        values = np.maximum.reduce(nodes_below(transition, *bottoms, order=0))
+        transition = self._kept_transition(0, grid, tops[0].grid, share)
+        upper = self._highest(transition, tops, meets) if np.all(safe[meets]) else 1.0
+        values = np.maximum.reduce(nodes_below(transition, *bottoms, order=0)).ravel()
         inside = contains(region, Interval.point(grid.nodes()), 0)[0]
         if self.ending is not None:
             inside &= contains(self.ending, Interval.point(grid.nodes()), 0)[1]
-        values = values.ravel()[inside]
-        return upper, float(values.max()) if len(values) else 0.0
+        return upper, float(values[inside].max()) if inside.any() else 0.0
 
     def _highest(self, transition: AnyTransition, above: Parts, meets: Mask) -> float:
         nodal, bend, known = values_above(transition, *above)
@@ -384,10 +388,6 @@ class Work:
             top = top + np.maximum(-bend[i], 0.0) * transition.step.grid.widths(i) ** 2 / 8 * (1 + 1e-12)
         top = np.where(known, top, 1.0).ravel()[meets]
         return float(top.max())
-
-    def _start_region(self) -> Region:
-        initial = self.problem.initial
-        return Box(initial.mean, initial.mean) if initial.random else initial
 
     def _start_grid(self, region: Region, share: float) -> Grid:
         low, high = box_around([Inside(region)], self.n, 0)

@@ -255,7 +255,7 @@ def _finer(
 
 _SHARES = {
     1: (0.33, 0.15, 0.07, 0.035, 0.0175, 0.01),
-    2: (0.5, 0.33, 0.22, 0.15, 0.1, 0.07, 0.05, 0.035),
+    2: (0.5, 0.33, 0.22, 0.2, 0.15, 0.1, 0.07, 0.05, 0.035),
     3: (0.4, 0.17, 0.14, 0.1, 0.07),
 }
 """Sizes of the cells that are tried, relative to the lengths over which the solution changes."""

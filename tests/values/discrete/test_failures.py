@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from typing import Any
 
 import numpy as np
@@ -49,6 +51,26 @@ def test_one_step_is_a_normal_probability() -> None:
     exact = norm.sf((1 - 0.08) / 0.3) + norm.cdf((-1 - 0.08) / 0.3)
     assert found.lower <= exact <= found.upper <= exact * 1.001
     assert found.lower >= exact / 1.001
+
+
+def test_both_sides_at_once_are_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = cb.DiscreteSystem(
+        lambda x: [x[0] + 0.1 * x[1], x[1] - 0.5 * np.sin(x[0])], states=2, noise=cb.Gaussian(std=0.3)
+    )
+    problem = cb.Problem(system, initial=[0.1, 0.1], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=5)
+    found, where, below = [], set[str](), failures.back_below
+
+    def noted(*given: Any) -> Any:
+        where.add(threading.current_thread().name)
+        return below(*given)
+
+    monkeypatch.setattr(failures, "back_below", noted)
+    for cells in (math.inf, 1):
+        monkeypatch.setattr(failures, "_APART", cells)
+        work = Work(problem, None, 4)
+        found.append(work.bounds(work.layout(0.5), 0.5))
+        assert len(where) == (1 if cells > 1 else 2)
+    assert found[0] == found[1]
 
 
 def test_a_set_of_starts_counts_its_worst_point() -> None:

@@ -7,7 +7,7 @@ for windows, and ``frames`` for limits that move.
 
 from certbound.values.continuous.plane.frames import bound_moving, moving
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times, spread_nodes
-from certbound.values.continuous.plane.plane_reach import Floats, floats_of, led, reach_of
+from certbound.values.continuous.plane.plane_reach import Floats, floats_of, led, plane_of, reach_of
 from certbound.values.continuous.plane.plane_targets import bound_failing
 from certbound.values.continuous.plane.plane_windows import bound_windows
 from certbound.values.continuous.plane.solver import Solver, integrated, solve_lines
@@ -20,7 +20,6 @@ from certbound.values.continuous.plane.two_sides import (
     chart_plane,
     confined,
     held_plane,
-    plane_of,
     released,
     rough_level,
     two_states,

@@ -11,6 +11,7 @@ from certbound.arrays import Array
 from certbound.problem.model import Node, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.continuous.hypotheses import Model
+from certbound.values.continuous.plane.plane_grids import Pair, Plane
 from certbound.values.continuous.room import Room
 
 _PATHS, _STEPS = 400, 200
@@ -85,3 +86,14 @@ def floats_of(model: Model) -> tuple[Floats, Floats]:
         return np.array([np.moveaxis(drift(t, x, y, *corner), -1, 0) for corner in corners])
 
     return drifts, lambda t, x, y: np.moveaxis(square(t, x, y), (-2, -1), (0, 1))
+
+
+def plane_of(
+    problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]
+) -> Plane:
+    """The model in floats on a box."""
+    drift, square = floats_of(model)
+    return Plane(
+        low=(low[0], low[1]), high=(high[0], high[1]), horizon=float(problem.horizon), drift=drift, square=square,
+        starts=starts, autonomous=model.autonomous,
+    )  # fmt: skip

@@ -38,9 +38,9 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment, pay_lower
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
-from certbound.values.continuous.plane.plane_reach import reach_of
+from certbound.values.continuous.plane.plane_reach import plane_of, reach_of
 from certbound.values.continuous.plane.target_proposal import Fate, propose_to_target, sides_of
-from certbound.values.continuous.plane.two_sides import RATE, plane_of
+from certbound.values.continuous.plane.two_sides import RATE
 from certbound.values.continuous.residual import value_range
 from certbound.values.continuous.room import limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface

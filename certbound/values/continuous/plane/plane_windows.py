@@ -34,9 +34,10 @@ from certbound.values.continuous.payment import Payment, pay_lower, pay_upper
 from certbound.values.continuous.plane.later import LaterAbove, LaterBelow, values_of
 from certbound.values.continuous.plane.plane_below import SketchBelow
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
+from certbound.values.continuous.plane.plane_reach import plane_of
 from certbound.values.continuous.plane.solver import integrated
 from certbound.values.continuous.plane.stages import Stage, master_nodes, nodes_within, stages_of
-from certbound.values.continuous.plane.two_sides import RATE, Sketch, plane_of
+from certbound.values.continuous.plane.two_sides import RATE, Sketch
 from certbound.values.continuous.room import points_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime

@@ -30,14 +30,14 @@ from certbound.values.continuous.hypotheses import (
     extreme_over,
     prove_upper,
     raised_above,
-    sampled_residual,
+    sampled,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane.monotone import propose_monotone
 from certbound.values.continuous.plane.plane_below import bound_plane_below, plan_below
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
-from certbound.values.continuous.plane.plane_reach import closed_plane, floats_of, led, reach_of
+from certbound.values.continuous.plane.plane_reach import closed_plane, led, plane_of, reach_of
 from certbound.values.continuous.room import Room, limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface
 from certbound.watch import OutOfTime
@@ -69,6 +69,8 @@ _VISITED = 0.05  # as next, of where cells are small
 _BEYOND = 0.35  # how far beyond simulated paths a box ends, in units of their extent
 _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 BELOW = 0.6  # of as many patches again, for a lower bound
+_NEVER = -20.0  # of log P: below that no proposal has led to a lower bound yet
+_SLOWLY = 0.14  # of the time to go, a slab: short enough there, however fine the cells are
 
 
 def two_states(
@@ -108,6 +110,8 @@ def bound_box(
     ``work`` holds about log P, the patches that are granted, and ``rare`` of `bound_plane_above`.
     """
     (inner, outer), (level, patches, rare) = boxes, work
+    if outer is not None and level < _NEVER:  # all is granted to the upper bound then
+        patches, outer = patches * (1 + BELOW if level > wanted else 1.0), None
     upper, done, proposed = bound_plane_above(inner, model, level, patches, rare)
     below: list[Proposed] = []
     if upper > wanted and outer is not None:
@@ -166,9 +170,10 @@ def _plan(plane: Plane, level: float, patches: float) -> Plan:
     held = held_anywhere(plane)
     share = _LONGER if held else 0.32 * min(max(-level / 3, 1.0), 3.0)
     floor = level - _DEEP if held and level < 0 else -math.inf
+    slowly = _SLOWLY if level < _NEVER and not held else 0.0
     for cells in itertools.count(16):
         plan = Plan(
-            cells=cells, growth=min(6 / cells, 0.3), lead=share / cells * plane.horizon, floor=floor,
+            cells=cells, growth=max(min(6 / cells, 0.3), slowly), lead=share / cells * plane.horizon, floor=floor,
             first=_FIRST if held else 0.1,
         )  # fmt: skip
         if cells**2 * len(slab_times(plane.horizon, plan)) > patches:
@@ -218,10 +223,11 @@ def _promising(
     """The proposal whose bound will be the smallest where V is the ``level``, or over the starts.
 
     The monotone ones are asked where splines through V break down, or the proof would lose much. ``kinds`` are tried
-    in turn, and what breaks down becomes the last of them; where nothing is promised the nearest alone stays.
+    in turn. On the next grid what breaks down comes last, and what promises nothing stays only if all do: the nearest.
     """
     best: Sketch | None = None
     nearest: Propose | None = None
+    vain = list[Propose]()
     for propose in list(kinds := _several() if kinds is None else kinds):
         tops = _SLOPING if held_anywhere(plane) else _TOPS if propose is propose_plane else _TOPS[1:]
         found = _refined(plane, model, plan, level, propose, tops)
@@ -230,6 +236,7 @@ def _promising(
             continue
         if best is not None and found.start >= best.estimate():
             break
+        vain += [propose] if found.estimate() >= 0 else []
         if best is None or found.estimate() < best.estimate():
             best, nearest = found, propose
         if best.estimate() < best.start + _POOR:
@@ -237,6 +244,7 @@ def _promising(
     if best is None or (level is None and best.estimate() >= 0):
         kinds[:] = kinds if nearest is None else [nearest]
         return None
+    kinds[:] = [propose for propose in kinds if propose not in vain or propose is nearest]
     return best.surface if covers(best.surface, plane.horizon, plane.low, plane.high, within=True) else None
 
 
@@ -276,9 +284,10 @@ class Sketch:
 
     @classmethod
     def of(cls, surface: Surface, model: Model, starts: list[Pair], level: float | None = None) -> Sketch:
+        """What eps pays is counted where V is highest on a patch: a proof knows no more of where R is."""
         start = extreme_over(surface, starts, upper=True) if level is None else level
-        highest, low = sampled_residual(surface, model)
-        paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - low - _VARIED, 50.0))
+        highest, low, high = sampled(surface, model)
+        paid = _GRANTED / float(surface.times[-1]) * np.exp(np.minimum(start - np.maximum(low + _VARIED, high), 50.0))
         return cls(surface=surface, start=start, excess=np.maximum(highest - paid, 0.0), low=low)
 
     def needed(self, top: float) -> Array:
@@ -387,13 +396,3 @@ def _near(problem: Problem, plane: Plane) -> Plane:
         for side, (box, pick) in enumerate(((plane.low, max), (plane.high, min)))
     ]
     return replace(plane, low=(ends[0][0], ends[0][1]), high=(ends[1][0], ends[1][1]))
-
-
-def plane_of(
-    problem: Problem, model: Model, low: tuple[float, ...], high: tuple[float, ...], starts: list[Pair]
-) -> Plane:
-    drift, square = floats_of(model)
-    return Plane(
-        low=(low[0], low[1]), high=(high[0], high[1]), horizon=float(problem.horizon), drift=drift, square=square,
-        starts=starts, autonomous=model.autonomous,
-    )  # fmt: skip
