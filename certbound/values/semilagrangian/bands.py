@@ -8,7 +8,7 @@ by at most (b - a)^2/32 sup |d_wwww T|. Each cell interpolates in its place; wha
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -226,11 +226,7 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
         tables.append(smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[1], least))
     unseen = float(np.abs(value.nodal).max() + (np.abs(value.bend) * np.diff(frame.q) ** 2).max() / 8) * band.beyond
     between = band.apart * least.fourth  # whatever share of either a cell takes
-    found = [
-        _landed(band, frame, mesh, replace(table, lift=table.lift + between, near=table.near + unseen))
-        for table in tables
-    ]
-    found += found[: 2 - len(found)]
+    at, curve, paid = _landed(band, frame, mesh, tables, between, unseen)
     share, live = band.share, band.live
     nodal = np.full((live.shape[0] + 1, live.shape[1] + 1), NOWHERE)
     bend = np.full((live.shape[0] + 1, live.shape[1]), -np.inf)
@@ -240,32 +236,35 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
         table[place] = np.maximum(table[place], np.where(live, mixed, nothing))
 
     for a in (slice(None, -1), slice(1, None)):
-        raised(bend, (a, slice(None)), found[0][1], found[1][1], -np.inf)
+        raised(bend, (a, slice(None)), curve[0], curve[-1], -np.inf)
         for b in (slice(None, -1), slice(1, None)):
-            raised(nodal, (a, b), found[0][0], found[1][0], NOWHERE)
+            raised(nodal, (a, b), at[0], at[-1], NOWHERE)
     bend = np.where(np.isfinite(bend), bend, 0.0)
-    return nodal, bend, ((1 - share) * found[0][2] + share * found[1][2]) * _UP
+    return nodal, bend, ((1 - share) * paid[0] + share * paid[-1]) * _UP
 
 
-def _landed(band: Band, frame: Frame, mesh: Array, found: Rows) -> tuple[Array, Array, Array]:
-    """The smoothed function of one kernel at the images of the band's nodes and cells, as ``through`` returns it."""
+def _landed(
+    band: Band, frame: Frame, mesh: Array, laws: list[Rows], between: Array, unseen: float
+) -> tuple[Array, Array, Array]:
+    """The smoothed functions at the images of the band's nodes and cells, as ``through`` returns them, law by law."""
     nodes, cells = slice(band.first, band.last + 1), slice(band.first, band.last)
-    image, radius = frame.image[:, nodes], frame.radius[:, nodes]
-    tables = np.stack([found.cross_low, found.cross_high, found.steep_y, found.steep_w])
-    wanted = _touched(band.live)
-    nodal = at_nodes(image, radius, wanted, mesh, frame.q, found.values, found.arch, tables[2:])
-    dq = np.diff(frame.q)
-    bend, extra = along_q(
-        image, radius, band.live, frame.bends[2:, cells], dq, mesh, frame.q, tables, found.bend, found.kinks,
-        (found.sagging, found.sway),
-    )  # fmt: skip
-    wide = np.stack([found.bent, found.mixed, found.bowed])
-    close = np.stack([found.lean_y, found.lean_q, found.lift, found.near])
+    image, radius, dq = frame.image[:, nodes], frame.radius[:, nodes], np.diff(frame.q)
+    tables = np.stack([[one.cross_low, one.cross_high, one.steep_y, one.steep_w] for one in laws])
+    bend, kinks = np.stack([one.bend for one in laws]), np.stack([one.kinks for one in laws])
+    values, arch = np.stack([one.values for one in laws]), np.stack([one.arch for one in laws])
+    nodal = at_nodes(image, radius, _touched(band.live), mesh, frame.q, values, arch, tables)
+    sagging, sway = np.stack([one.sagging for one in laws]), np.stack([one.sway for one in laws])
+    curve, extra = along_q(
+        image, radius, band.live, frame.bends[2:, cells], dq, mesh, frame.q, tables, bend, kinks, sagging, sway
+    )
+    least = laws[0]
+    wide = np.stack([least.bent, least.mixed, least.bowed, least.lean_y, least.lean_q])
+    close = np.stack([[one.lift + between, one.near + unseen] for one in laws])
     payment = over_cells(
         image, radius, band.live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), mesh,
-        frame.q, tables, found.bend, found.kinks, band.reach, band.prices, wide, close,
+        frame.q, tables, bend, kinks, band.reach, band.prices, wide, close,
     )  # fmt: skip
-    return nodal, bend, payment + np.maximum(extra[:-1], extra[1:])
+    return nodal, curve, payment + np.maximum(extra[:, :-1], extra[:, 1:])
 
 
 def _touched(live: Mask) -> Mask:
