@@ -19,9 +19,12 @@ from certbound.arrays import Array, Index, Mask
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+Ends = tuple[float, float]
+
 _NODES = (141, 121)
 _KICKS = np.polynomial.hermite_e.hermegauss(5)
 _LEAST = 1e-280
+_NEAR, _FARTHER = 4, 3.2  # nodes, and deviations of a step's noise, around all that paths come to: kicks are bounded
 _FLAT = 1e-3  # of the least answer: what lies below is flat
 
 
@@ -53,7 +56,7 @@ class Scouted:
 
 
 def scouted(
-    drift: Callable[[float, Array, Array], Array], noise: float, faces: tuple[tuple[float, float], tuple[float, float]],
+    drift: Callable[[float, Array, Array], Array], noise: float, faces: tuple[Ends, Ends],
     starts: Array, horizon: float, steps: int, broken: Callable[[Array, Array], Mask], *, timed: bool = False,
 ) -> Scouted | None:  # fmt: skip
     """Follow dp = F dt, dq = g dt + s dW; None where nothing fails or all does, or the drift is undefined.
@@ -108,6 +111,43 @@ def scouted(
     return Scouted(
         p=p, q=q, visits=visits, steep_p=steep_p, steep_q=steep_q, cells=cells, share=float(first.max())
     )  # fmt: skip
+
+
+def reached(
+    drift: Callable[[Array, Array], Array], noise: float, faces: tuple[Ends, Ends], starts: tuple[Ends, Ends],
+    step: float, count: int, broken: Callable[[Array, Array], Mask], *, overlooked: float,
+) -> tuple[list[Array], Mask] | None:  # fmt: skip
+    """The points of a grid that paths from the starts come near before they fail, at the times 0, step, 2 step, ...
+
+    Parameters
+    ----------
+    overlooked : float
+        What all points that are left out may be visited, of a path from every start on the grid.
+
+    Returns
+    -------
+    axes : list of ndarray
+    found : ndarray of bool, shape (count + 1, *grid)
+    """
+    from scipy.ndimage import maximum_filter
+
+    axes = [np.linspace(*ends, nodes) for ends, nodes in zip(faces, _NODES)]
+    p, q = (part.ravel() for part in np.meshgrid(*axes, indexing="ij"))
+    chain, _ = _chain(drift, noise, axes, (p, q), step)
+    if chain is None:
+        return None
+    fails, back, cells = broken(p, q), chain.T.tocsr(), [axis[1] - axis[0] for axis in axes]
+    near = [(x >= low - cell) & (x <= high + cell) for x, (low, high), cell in zip((p, q), starts, cells)]
+    mass = np.where(near[0] & near[1], 1.0, 0.0)
+    wide = _NEAR, _NEAR + int(np.ceil(_FARTHER * noise * np.sqrt(step) / cells[1]))
+    found = np.zeros((count + 1, *_NODES), dtype=bool)
+    for k in range(count + 1):
+        rising = np.sort(mass)
+        least = rising[np.searchsorted(np.cumsum(rising), overlooked / (count + 1))]
+        seen = (mass >= least).reshape(_NODES)
+        found[k] = maximum_filter(seen, [2 * width + 1 for width in wide])
+        mass = back @ np.where(fails, 0.0, mass)
+    return axes, found
 
 
 def _chain(

@@ -17,7 +17,7 @@ from certbound.rigor.series import ZERO
 from certbound.values.discrete import evaluate
 from certbound.values.grids import Grid
 from certbound.values.scouting import Scouted
-from certbound.values.semilagrangian.backward import Bounds, bounds_below, levels_above
+from certbound.values.semilagrangian.backward import Bounds, Layout, bounds_below, levels_above
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
 from certbound.values.semilagrangian.confines import Wall
 from certbound.values.semilagrangian.flows import flow, sheared
@@ -47,17 +47,6 @@ _TOGETHER, _ALIKE = 8, 0.45
 """Steps that share all but the images of nodes, at most, and how far apart, in deviations of their noise, these are."""
 
 Images = tuple[Array, Array, Mask]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Layout:
-    """All that an induction needs."""
-
-    clock: Clock
-    frame: Frame
-    bands: list[Band]
-    above: Bounds
-    below: Bounds
 
 
 def layouts_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Iterator[Layout]:

@@ -220,7 +220,7 @@ def over_cells(
     image: Array, radius: Array, live: Mask, slopes: Array, bends: Array, sides: tuple[Array, Array], mesh: Array,
     q: Array, tables: Array, bend: Array, kinks: Array, reach: Array, prices: Array, wide: Array, close: Array,
 ) -> Array:  # fmt: skip
-    """What every cell pays, law by law: interpolation along y, the rows' interpolation, covariance, remainder, rounding.
+    """What every cell pays, law by law: interpolation along y, that of the rows, covariance, remainder, rounding.
 
     Parameters
     ----------

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 
@@ -14,11 +15,11 @@ from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous import ExitBounds
-from certbound.values.grids import around_nodes
-from certbound.values.scouting import Scouted, scouted
-from certbound.values.semilagrangian.backward import Bounds, back, highest, limited, lowest
+from certbound.values.grids import around_nodes, corners
+from certbound.values.scouting import Scouted, reached, scouted
+from certbound.values.semilagrangian.backward import Bounds, Layout, back, highest, limited, lowest
 from certbound.values.semilagrangian.carried import bound_carried_exits, carries
-from certbound.values.semilagrangian.groundwork import Layout, layouts_of, nodes_of, together
+from certbound.values.semilagrangian.groundwork import layouts_of, nodes_of, together
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
@@ -41,6 +42,7 @@ _ROUGH = 0.2, (1.0, 0.008, 0.4, 0.12)  # where the model changes with time, and 
 _BETWEEN = 5
 _FIRST = 0.25  # share of the work that a first look may take where no scout tells how rare failing is
 _SPARE = 1e-9
+_OVERLOOKED = 1e-8  # what cells that are left out may cost, as a share of a scout's answer
 _CAUTION = 0.1  # for a scout's answer
 _RATE = 800_000
 """Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes, `_IMAGED`
@@ -156,6 +158,14 @@ def _affordable(
 
 def scout_of(setting: Setting) -> Scouted | None:
     """Where paths that fail go, roughly; None where that is not found."""
+    drift, broken = _motion(setting)
+    steps = min(max(_LEAST, math.ceil(setting.horizon / (_PACE * _turn(setting)))), _MOST // 8)
+    faces, starts, timed = setting.faces, setting.some_starts(), setting.timed
+    return scouted(drift, setting.noise, faces, starts, setting.horizon, steps, broken, timed=timed)
+
+
+def _motion(setting: Setting) -> tuple[Callable[[float, Array, Array], Array], Callable[[Array, Array], Mask]]:
+    """The drift at a time and points, in floats, and which points walls forbid."""
     model = compile_numpy(setting.tape)
 
     def drift(t: float, p: Array, q: Array) -> Array:
@@ -167,9 +177,31 @@ def scout_of(setting: Setting) -> Scouted | None:
             found |= ~wall.safe(wall.sizes(Interval.point(p), Interval.point(q)), np.zeros((1, 1)))
         return found
 
-    steps = min(max(_LEAST, math.ceil(setting.horizon / (_PACE * _turn(setting)))), _MOST // 8)
-    faces, starts, timed = setting.faces, setting.some_starts(), setting.timed
-    return scouted(drift, setting.noise, faces, starts, setting.horizon, steps, broken, timed=timed)
+    return drift, broken
+
+
+def _reached(setting: Setting, plan: Plan, scout: Scouted | None) -> Callable[[Layout, int], Mask | None]:
+    """Which cells paths come to after so many steps, in floats; None where that is not known."""
+    drift, broken = _motion(setting)
+    found = None
+    if scout is not None and not setting.timed:
+        found = reached(
+            partial(drift, 0.0), setting.noise, setting.faces, setting.starts, setting.horizon / plan.count,
+            plan.count, broken, overlooked=_OVERLOOKED * scout.share,
+        )  # fmt: skip
+
+    def cells(layout: Layout, k: int) -> Mask | None:
+        if found is None:
+            return None
+        frame, (axes, seen) = layout.frame, found
+        p = frame.y[:, None] + layout.clock.shear * frame.q
+        place = [
+            np.clip(np.rint((x - axis[0]) / (axis[1] - axis[0])), 0, len(axis) - 1).astype(int)
+            for axis, x in zip(axes, (p, np.broadcast_to(frame.q, p.shape)))
+        ]
+        return np.asarray(np.logical_or.reduce(corners(seen[k][tuple(place)])))
+
+    return cells
 
 
 def bounds_by_steps(
@@ -187,7 +219,8 @@ def bounds_by_steps(
     """
     values: list[Lines | None] = []
     layout: Layout | None = None
-    for following in layouts or layouts_of(setting, plan, scout):
+    reached_by = _reached(setting, plan, scout)
+    for k, following in enumerate(layouts or layouts_of(setting, plan, scout)):
         poll("a value function along the flow")
         sides = [following.above, following.below][: 1 + below]
         if layout is None:
@@ -195,7 +228,9 @@ def bounds_by_steps(
         elif following.bands is not layout.bands:  # what a step asks of the function at its end
             values = [value and limited(following.frame, s, value.nodal, value.bend) for s, value in zip(sides, values)]
         layout = following
-        values = [value and back(layout.frame, layout.bands, side, value) for side, value in zip(sides, values)]
+        seen = layout.on(reached_by(layout, plan.count - 1 - k))
+        sides = [seen.above, seen.below][: 1 + below]
+        values = [value and back(seen.frame, seen.bands, side, value) for side, value in zip(sides, values)]
         values = [None if value is None or np.abs(value.nodal).max() > _TALLEST else value for value in values]
         if not any(values):
             break
