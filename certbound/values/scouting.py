@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
+from certbound.values.grids import corners
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -113,21 +114,31 @@ def scouted(
     )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Reached:
+    """Points of a grid that paths come near before they fail, ``seen`` (K, *grid) at the times 0, step, 2 step, ..."""
+
+    axes: list[Array]
+    seen: Mask
+
+    def cells(self, y: Array, q: Array, shear: float, k: int | None = None) -> Mask:
+        """Which cells of (y, q), p = y + shear q, have such a corner at a time (at any)."""
+        seen = np.asarray(self.seen.any(axis=0) if k is None else self.seen[k])
+        p = y[:, None] + shear * q
+        place = [
+            np.clip(np.rint((x - axis[0]) / (axis[1] - axis[0])), 0, len(axis) - 1).astype(int)
+            for axis, x in zip(self.axes, (p, np.broadcast_to(q, p.shape)))
+        ]
+        return np.asarray(np.logical_or.reduce(corners(seen[tuple(place)])))
+
+
 def reached(
     drift: Callable[[Array, Array], Array], noise: float, faces: tuple[Ends, Ends], starts: tuple[Ends, Ends],
     step: float, count: int, broken: Callable[[Array, Array], Mask], *, overlooked: float,
-) -> tuple[list[Array], Mask] | None:  # fmt: skip
-    """The points of a grid that paths from the starts come near before they fail, at the times 0, step, 2 step, ...
+) -> Reached | None:  # fmt: skip
+    """What paths from the starts come near in ``count`` steps; None where the drift is undefined.
 
-    Parameters
-    ----------
-    overlooked : float
-        What all points that are left out may be visited, of a path from every start on the grid.
-
-    Returns
-    -------
-    axes : list of ndarray
-    found : ndarray of bool, shape (count + 1, *grid)
+    ``overlooked``: what all points that are left out may be visited, of a path from every start on the grid.
     """
     from scipy.ndimage import maximum_filter
 
@@ -147,7 +158,7 @@ def reached(
         seen = (mass >= least).reshape(_NODES)
         found[k] = maximum_filter(seen, [2 * width + 1 for width in wide])
         mass = back @ np.where(fails, 0.0, mass)
-    return axes, found
+    return Reached(axes=axes, seen=found)
 
 
 def _chain(

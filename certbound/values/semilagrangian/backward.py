@@ -10,6 +10,7 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.values.grids import around_nodes, corners
+from certbound.values.scouting import Reached
 from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, narrowed, through
 from certbound.values.semilagrangian.confines import TWICE
 from certbound.values.semilagrangian.local_steps import Clock
@@ -69,10 +70,12 @@ class Layout:
     above: Bounds
     below: Bounds
 
-    def on(self, cells: Mask | None) -> Layout:
+    def on(self, k: int, seen: Reached) -> Layout:
+        """What steps from the k-th time only those cells that paths come to by then."""
+        return self.only(seen.cells(self.frame.y, self.frame.q, self.clock.shear, k))
+
+    def only(self, cells: Mask) -> Layout:
         """The same, but no cell is stepped save these: the others count as failing above, as not failing below."""
-        if cells is None:
-            return self
         left = around_nodes((self.frame.live & ~cells).astype(float), largest=True) > 0
         level = np.where(left, np.maximum(self.above.level, 1.0), self.above.level)
         frame = replace(self.frame, live=self.frame.live & cells)

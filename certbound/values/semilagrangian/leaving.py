@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -15,8 +16,8 @@ from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous import ExitBounds
-from certbound.values.grids import around_nodes, corners
-from certbound.values.scouting import Scouted, reached, scouted
+from certbound.values.grids import around_nodes
+from certbound.values.scouting import Reached, Scouted, reached, scouted
 from certbound.values.semilagrangian.backward import Bounds, Layout, back, highest, limited, lowest
 from certbound.values.semilagrangian.carried import bound_carried_exits, carries
 from certbound.values.semilagrangian.groundwork import layouts_of, nodes_of, together
@@ -180,28 +181,15 @@ def _motion(setting: Setting) -> tuple[Callable[[float, Array, Array], Array], C
     return drift, broken
 
 
-def _reached(setting: Setting, plan: Plan, scout: Scouted | None) -> Callable[[Layout, int], Mask | None]:
-    """Which cells paths come to after so many steps, in floats; None where that is not known."""
+def _reached(setting: Setting, plan: Plan, scout: Scouted | None) -> Reached | None:
+    """Where paths are after so many steps, in floats; None where that is not known."""
+    if scout is None or setting.timed:
+        return None
     drift, broken = _motion(setting)
-    found = None
-    if scout is not None and not setting.timed:
-        found = reached(
-            partial(drift, 0.0), setting.noise, setting.faces, setting.starts, setting.horizon / plan.count,
-            plan.count, broken, overlooked=_OVERLOOKED * scout.share,
-        )  # fmt: skip
-
-    def cells(layout: Layout, k: int) -> Mask | None:
-        if found is None:
-            return None
-        frame, (axes, seen) = layout.frame, found
-        p = frame.y[:, None] + layout.clock.shear * frame.q
-        place = [
-            np.clip(np.rint((x - axis[0]) / (axis[1] - axis[0])), 0, len(axis) - 1).astype(int)
-            for axis, x in zip(axes, (p, np.broadcast_to(frame.q, p.shape)))
-        ]
-        return np.asarray(np.logical_or.reduce(corners(seen[k][tuple(place)])))
-
-    return cells
+    return reached(
+        partial(drift, 0.0), setting.noise, setting.faces, setting.starts, setting.horizon / plan.count, plan.count,
+        broken, overlooked=_OVERLOOKED * scout.share,
+    )  # fmt: skip
 
 
 def bounds_by_steps(
@@ -219,21 +207,20 @@ def bounds_by_steps(
     """
     values: list[Lines | None] = []
     layout: Layout | None = None
-    reached_by = _reached(setting, plan, scout)
-    for k, following in enumerate(layouts or layouts_of(setting, plan, scout)):
-        poll("a value function along the flow")
-        sides = [following.above, following.below][: 1 + below]
-        if layout is None:
-            values = [terminal(following, bounds) for bounds in sides]
-        elif following.bands is not layout.bands:  # what a step asks of the function at its end
-            values = [value and limited(following.frame, s, value.nodal, value.bend) for s, value in zip(sides, values)]
-        layout = following
-        seen = layout.on(reached_by(layout, plan.count - 1 - k))
-        sides = [seen.above, seen.below][: 1 + below]
-        values = [value and back(seen.frame, seen.bands, side, value) for side, value in zip(sides, values)]
-        values = [None if value is None or np.abs(value.nodal).max() > _TALLEST else value for value in values]
-        if not any(values):
-            break
+    seen = _reached(setting, plan, scout)
+    with ThreadPoolExecutor(2) as pool:  # compiled kernels and arithmetic of arrays run without the interpreter's lock
+        for k, following in enumerate(layouts or layouts_of(setting, plan, scout, seen)):
+            poll("a value function along the flow")
+            sides = [following.above, following.below][: 1 + below]
+            if layout is None:
+                values = [terminal(following, bounds) for bounds in sides]
+            elif following.bands is not layout.bands:  # what a step asks of the function at its end
+                values = [v and limited(following.frame, side, v.nodal, v.bend) for side, v in zip(sides, values)]
+            layout = following
+            part = layout if seen is None else layout.on(plan.count - 1 - k, seen)
+            values = list(pool.map(partial(_stepped, part), (part.above, part.below), values))
+            if not any(values):
+                break
     assert layout is not None
     upper, lower, rare = 1.0, 0.0, _RARE * plan.count * plan.spare
     if values[0] is not None:
@@ -243,6 +230,14 @@ def bounds_by_steps(
         best = -lowest(layout.frame, values[1], setting.some_starts(), layout.clock.shear)
         lower = max(0.0, best * (1 - 1e-12) - rare)
     return upper, lower
+
+
+def _stepped(layout: Layout, side: Bounds, value: Lines | None) -> Lines | None:
+    """One side, one step back; None where it has grown beyond what is paid for."""
+    if value is None:
+        return None
+    value = back(layout.frame, layout.bands, side, value)
+    return None if np.abs(value.nodal).max() > _TALLEST else value
 
 
 def terminal(layout: Layout, bounds: Bounds) -> Lines:

@@ -41,7 +41,7 @@ def bounds_on(layout: backward.Layout, chosen) -> tuple[float, float]:
     """Bounds from steps on cells that ``chosen`` picks, step by step, from p and q in their middles."""
     y, q = ((axis[1:] + axis[:-1]) / 2 for axis in (layout.frame.y, layout.frame.q))
     p = y[:, None] + layout.clock.shear * q
-    steps = [layout.on(chosen(k, p, np.broadcast_to(q, p.shape))) for k in reversed(range(PLAN.count))]
+    steps = [layout.only(chosen(k, p, np.broadcast_to(q, p.shape))) for k in reversed(range(PLAN.count))]
     values = [leaving.terminal(layout, side) for side in (layout.above, layout.below)]
     for one in steps:
         values = [back(one.frame, one.bands, side, v) for side, v in zip((one.above, one.below), values)]
@@ -101,7 +101,7 @@ def test_paths_stay_near_what_is_reached(rng) -> None:
     drift, broken = leaving._motion(one)
     found = reached(partial(drift, 0.0), one.noise, one.faces, one.starts, 0.05, 20, broken, overlooked=1e-6)
     assert found is not None
-    axes, seen = found
+    axes, seen = found.axes, found.seen
     assert seen[0].mean() < 0.05
     assert seen[4].mean() < 0.6
     x = np.zeros((2, 20_000))
