@@ -302,7 +302,7 @@ def _landed(
     )
     least = laws[0]
     wide = np.stack([least.bent, least.mixed, least.bowed, least.lean_y, least.lean_q])
-    close = np.stack([[one.lift + between, one.near + unseen] for one in laws])
+    close = np.stack([table for one in laws for table in (one.lift + between, one.near + unseen)])
     payment = over_cells(
         image, radius, live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), *mesh,
         tables, bend, kinks, band.reach, band.prices, wide, close,

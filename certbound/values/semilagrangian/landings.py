@@ -34,8 +34,8 @@ def _cell_near(axis: Array, place: float, guess: int) -> int:
 
 
 @compiled
-def _density(window: Index, tables: Array, rates: Array, bend: Array) -> tuple[float, float]:
-    """sup of the density over a window, without -W'' w_t^2 and with it.
+def _density(window: Index, tables: Array, rates: Array, bend: Array, found: Array) -> None:
+    """sup of the density over a window, without -W'' w_t^2 and with it: ``found`` (laws, 2).
 
     ``tables`` cross_low, cross_high, steep_y, steep_w; ``rates`` ranges of y_t and w_t, bounds of |y_tt| and |w_tt|.
     """
@@ -44,21 +44,22 @@ def _density(window: Index, tables: Array, rates: Array, bend: Array) -> tuple[f
     smallest = 0.0 if w0 <= 0.0 <= w1 else min(abs(w0), abs(w1)) ** 2
     p = min(min(y0 * w0, y0 * w1), min(y1 * w0, y1 * w1))
     r = max(max(y0 * w0, y0 * w1), max(y1 * w0, y1 * w1))
-    plain, whole = -np.inf, -np.inf
+    for n in range(len(found)):
+        found[n, 0], found[n, 1] = -np.inf, -np.inf
     for k in range(window[0], window[1] + 1):
         for c in range(window[2], window[3] + 1):
-            b = max(bend[k, c], bend[k + 1, c])
-            a, d = tables[0, k, c], tables[1, k, c]
-            mixed = min(min(a * p, a * r), min(d * p, d * r))
-            total = tables[2, k, c] * rates[4] + tables[3, k, c] * rates[5] - 2 * mixed
-            plain = max(plain, total)
-            whole = max(whole, total + (b * largest if b > 0 else b * smallest))
-    return plain, whole
+            for n in range(len(found)):
+                b = max(bend[n, k, c], bend[n, k + 1, c])
+                a, d = tables[n, 0, k, c], tables[n, 1, k, c]
+                mixed = min(min(a * p, a * r), min(d * p, d * r))
+                total = tables[n, 2, k, c] * rates[4] + tables[n, 3, k, c] * rates[5] - 2 * mixed
+                found[n, 0] = max(found[n, 0], total)
+                found[n, 1] = max(found[n, 1], total + (b * largest if b > 0 else b * smallest))
 
 
 @compiled
 def _mean_bent(
-    window: Index, q: Array, ends: tuple[float, float], loose: float, rates: Array, sagging: Array, sway: Array
+    n: int, window: Index, q: Array, ends: tuple[float, float], loose: float, rates: Array, sagging: Array, sway: Array
 ) -> float:
     """Mean and a sixth of the change of a linear bound of -W'' w_t^2 along a side whose image has these ends in w."""
     c, d = _cell_near(q, ends[0], window[2]), _cell_near(q, ends[1], window[3])
@@ -66,16 +67,17 @@ def _mean_bent(
     t = min(max((ends[1] - q[d]) / (q[d + 1] - q[d]), 0.0), 1.0)
     one, two, steep, above, span = -np.inf, -np.inf, 0.0, 0.0, ends[1] - ends[0]
     for k in range(window[0], window[1] + 2):
-        one = max(one, (1 - s) * sagging[k, c] + s * sagging[k, c + 1])
-        two = max(two, (1 - t) * sagging[k, d] + t * sagging[k, d + 1])
+        one = max(one, (1 - s) * sagging[n, k, c] + s * sagging[n, k, c + 1])
+        two = max(two, (1 - t) * sagging[n, k, d] + t * sagging[n, k, d + 1])
     more = 0.0
-    for n in range(window[2], window[3] + 1):
-        level, width = -np.inf, q[n + 1] - q[n]
+    for e in range(window[2], window[3] + 1):
+        level, lean = -np.inf, 0.0
         for k in range(window[0], window[1] + 2):
-            more = max(more, sway[k, n])
-            steep = max(steep, abs(sagging[k, n + 1] - sagging[k, n]) / width)
-            level = max(level, sagging[k, n + 1])
-        share = (q[n + 1] - ends[0]) / span if span != 0.0 else 0.0
+            more = max(more, sway[n, k, e])
+            lean = max(lean, abs(sagging[n, k, e + 1] - sagging[n, k, e]))
+            level = max(level, sagging[n, k, e + 1])
+        steep = max(steep, lean / (q[e + 1] - q[e]))
+        share = (q[e + 1] - ends[0]) / span if span != 0.0 else 0.0
         if 0.0 < share < 1.0:
             above = max(above, level - (1 - share) * one - share * two)
     above += more + steep * loose
@@ -87,48 +89,43 @@ def _mean_bent(
 
 
 @compiled
-def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
-    """Upper bound of the sum of the kinks that a path of that length in y crosses within a window."""
-    total, largest, least = 0.0, 0.0, np.inf
-    for k in range(window[0] + 1, window[1] + 1):
-        most = 0.0
-        for c in range(window[2], window[3] + 1):
-            most = max(most, kinks[k, c])
-        total += most
-        largest = max(largest, most)
-        least = min(least, mesh[k + 1] - mesh[k])
-    if largest == 0.0:
-        return 0.0
-    return float(min(total, largest * (1 + np.floor(longest / least * 1.000001))))
-
-
-@compiled
-def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array) -> float:
+def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array, found: Array) -> None:
     """What kinks that a path crosses lift it above its chord: |y_t| tau (1 - tau) times each, tau where it does.
 
-    ``ends`` holds the ranges of y at both ends. Where y_t may vanish a kink costs its slope times the range of y.
+    ``ends`` holds the ranges of y at both ends. Where y_t may vanish a kink costs its slope times the range of y, and
+    no path of a length crosses more of them than fit into it. ``found`` (laws, 4): that, and room for sums.
     """
-    longest = max(abs(rates[0]), abs(rates[1]))
-    whole = longest * _kinked(window, kinks, mesh, longest)
-    if rates[0] <= 0.0 <= rates[1]:
-        return float(whole)
-    sign = 1.0 if rates[0] > 0.0 else -1.0
-    slow, fast = min(abs(rates[0]), abs(rates[1])), longest
+    for n in range(len(found)):
+        found[n, 0], found[n, 1], found[n, 2], found[n, 3] = 0.0, 0.0, 0.0, 0.0
+    if window[0] == window[1]:
+        return
+    turns, sign = rates[0] <= 0.0 <= rates[1], 1.0 if rates[0] > 0.0 else -1.0
+    slow, fast = min(abs(rates[0]), abs(rates[1])), max(abs(rates[0]), abs(rates[1]))
     start, stop = (ends[0], ends[1]), (ends[2], ends[3])
     if sign < 0.0:
         start, stop = (-ends[1], -ends[0]), (-ends[3], -ends[2])
-    total = 0.0
+    least = np.inf
     for k in range(window[0] + 1, window[1] + 1):
-        most, place = 0.0, sign * mesh[k]
-        for c in range(window[2], window[3] + 1):
-            most = max(most, kinks[k, c])
-        early = max((place - start[1]) / fast, 1 - (stop[1] - place) / slow) - 1e-6
-        late = min((place - start[0]) / slow, 1 - (stop[0] - place) / fast) + 1e-6
-        early, late = max(early, 0.0), min(late, 1.0)
-        if early <= late:
-            nearest = min(max(0.5, early), late)
-            total += most * nearest * (1 - nearest)
-    return float(min(0.25 * whole, longest * total))
+        least = min(least, mesh[k + 1] - mesh[k])
+        share, place = 0.0, sign * mesh[k]
+        if not turns:
+            early = max((place - start[1]) / fast, 1 - (stop[1] - place) / slow) - 1e-6
+            late = min((place - start[0]) / slow, 1 - (stop[0] - place) / fast) + 1e-6
+            early, late = max(early, 0.0), min(late, 1.0)
+            if early <= late:
+                nearest = min(max(0.5, early), late)
+                share = nearest * (1 - nearest)
+        for n in range(len(found)):
+            most = 0.0
+            for c in range(window[2], window[3] + 1):
+                most = max(most, kinks[n, k, c])
+            found[n, 1] += most
+            found[n, 2] = max(found[n, 2], most)
+            found[n, 3] += most * share
+    fit = 1 + np.floor(fast / least * 1.000001)
+    for n in range(len(found)):
+        whole = fast * min(found[n, 1], found[n, 2] * fit)
+        found[n, 0] = whole if turns else min(0.25 * whole, fast * found[n, 3])
 
 
 @compiled
@@ -184,6 +181,7 @@ def along_q(
     lines, columns = image.shape[1], image.shape[2] - 1
     curve, extra = np.zeros((len(bend), lines, columns)), np.zeros((len(bend), lines, columns))
     rates, places, box, window = np.empty(6), np.empty(4), np.empty(4), np.zeros(4, dtype=np.intp)
+    dense, lifted = np.empty((len(bend), 2)), np.empty((len(bend), 4))
     for i in range(lines):
         for j in range(columns):
             below, above = i > 0 and live[i - 1, j], i < lines - 1 and live[i, j]
@@ -207,11 +205,12 @@ def along_q(
                 slack = radius[0, i, j + side]
                 places[2 * side], places[2 * side + 1] = image[0, i, j + side] - slack, image[0, i, j + side] + slack
             ends = (image[1, i, j], image[1, i, j + 1])
+            _density(window, tables, rates, bend, dense)
+            _crossed(window, kinks, mesh, places, rates, lifted)
             for n in range(len(bend)):
-                mean = _mean_bent(window, q, ends, sag, rates, sagging[n], sway[n])
-                plain, whole = _density(window, tables[n], rates, bend[n])
-                curve[n, i, j] = min(mean + plain, whole) / square
-                extra[n, i, j] = _crossed(window, kinks[n], mesh, places, rates)
+                mean = _mean_bent(n, window, q, ends, sag, rates, sagging, sway)
+                curve[n, i, j] = min(mean + dense[n, 0], dense[n, 1]) / square
+                extra[n, i, j] = lifted[n, 0]
     return curve, extra
 
 
@@ -234,11 +233,13 @@ def over_cells(
         How far the covariance's excess is followed along y.
     prices : (6, cells, nq - 1)
         Of ``wide`` (bent, mixed, bowed, lean_y, lean_q: of all laws) and of the last of ``close``.
-    close : (laws, 2, rows - 1, nq - 1)
-        lift, which costs itself, and near.
+    close : (2 laws, rows - 1, nq - 1)
+        lift, which costs itself, and near, law by law.
     """
     found = np.zeros((len(bend), *live.shape))
     rates, ends, places, window = np.empty(6), np.empty(4), np.empty(4), np.zeros(4, dtype=np.intp)
+    dense, lifted, tops = np.empty((len(bend), 2)), np.empty((len(bend), 4)), np.empty(max(len(wide), len(close)))
+    leans, bents = wide[3:], wide[:3]
     for i in range(live.shape[0]):
         for j in range(live.shape[1]):
             if not live[i, j]:
@@ -259,25 +260,29 @@ def over_cells(
                 slack = bends[2, i, j] * e * e / 8 + max(radius[0, i + a, j], radius[0, i + a, j + 1])
                 places[2 * a] = min(image[0, i + a, j], image[0, i + a, j + 1]) - slack
                 places[2 * a + 1] = max(image[0, i + a, j], image[0, i + a, j + 1]) + slack
-            shared = prices[3, i, j] * _largest(window, wide[3]) + prices[4, i, j] * _largest(window, wide[4])
+            _density(window, tables, rates, bend, dense)
+            _crossed(window, kinks, mesh, places, rates, lifted)
+            _largest(window, leans, tops)
+            shared = prices[3, i, j] * tops[0] + prices[4, i, j] * tops[1]
+            _largest(window, close, tops)
             for n in range(len(bend)):
-                total = max(_density(window, tables[n], rates, bend[n])[1], 0.0) / 8
-                total += _crossed(window, kinks[n], mesh, places, rates)
-                total += _largest(window, close[n, 0]) + prices[5, i, j] * _largest(window, close[n, 1])
+                total = max(dense[n, 1], 0.0) / 8 + lifted[n, 0] + tops[2 * n] + prices[5, i, j] * tops[2 * n + 1]
                 found[n, i, j] = total + shared
             ends[0], ends[1] = ends[0] - reach[i, j], ends[1] + reach[i, j]
             _look(window, mesh, q, ends)
-            for part in range(3):
-                shared = prices[part, i, j] * _largest(window, wide[part])
-                for n in range(len(bend)):
-                    found[n, i, j] += shared
+            _largest(window, bents, tops)
+            shared = prices[0, i, j] * tops[0] + prices[1, i, j] * tops[1] + prices[2, i, j] * tops[2]
+            for n in range(len(bend)):
+                found[n, i, j] += shared
     return found
 
 
 @compiled
-def _largest(window: Index, table: Array) -> float:
-    best = -np.inf
+def _largest(window: Index, tables: Array, tops: Array) -> None:
+    """The largest value of each of the tables over a window."""
+    for n in range(len(tables)):
+        tops[n] = -np.inf
     for k in range(window[0], window[1] + 1):
         for c in range(window[2], window[3] + 1):
-            best = max(best, table[k, c])
-    return best
+            for n in range(len(tables)):
+                tops[n] = max(tops[n], tables[n, k, c])
