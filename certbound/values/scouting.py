@@ -26,6 +26,7 @@ _NODES = (141, 121)
 _KICKS = np.polynomial.hermite_e.hermegauss(5)
 _LEAST = 1e-280
 _NEAR, _FARTHER = 4, 3.2  # nodes, and deviations of a step's noise, around all that paths come to: kicks are bounded
+_CHAINS = 12  # for the times of a model that changes with it, where only that is asked
 _FLAT = 1e-3  # of the least answer: what lies below is flat
 
 
@@ -121,9 +122,9 @@ class Reached:
     axes: list[Array]
     seen: Mask
 
-    def cells(self, y: Array, q: Array, shear: float, k: int | None = None) -> Mask:
-        """Which cells of (y, q), p = y + shear q, have such a corner at a time (at any)."""
-        seen = np.asarray(self.seen.any(axis=0) if k is None else self.seen[k])
+    def cells(self, y: Array, q: Array, shear: float, when: slice) -> Mask:
+        """Which cells of (y, q), p = y + shear q, have such a corner at some of these times."""
+        seen = np.asarray(self.seen[when].any(axis=0))
         p = y[:, None] + shear * q
         place = [
             np.clip(np.rint((x - axis[0]) / (axis[1] - axis[0])), 0, len(axis) - 1).astype(int)
@@ -133,8 +134,8 @@ class Reached:
 
 
 def reached(
-    drift: Callable[[Array, Array], Array], noise: float, faces: tuple[Ends, Ends], starts: tuple[Ends, Ends],
-    step: float, count: int, broken: Callable[[Array, Array], Mask], *, overlooked: float,
+    drift: Callable[[float, Array, Array], Array], noise: float, faces: tuple[Ends, Ends], starts: tuple[Ends, Ends],
+    step: float, count: int, broken: Callable[[Array, Array], Mask], *, overlooked: float, timed: bool = False,
 ) -> Reached | None:  # fmt: skip
     """What paths from the starts come near in ``count`` steps; None where the drift is undefined.
 
@@ -144,10 +145,8 @@ def reached(
 
     axes = [np.linspace(*ends, nodes) for ends, nodes in zip(faces, _NODES)]
     p, q = (part.ravel() for part in np.meshgrid(*axes, indexing="ij"))
-    chain, _ = _chain(drift, noise, axes, (p, q), step)
-    if chain is None:
-        return None
-    fails, back, cells = broken(p, q), chain.T.tocsr(), [axis[1] - axis[0] for axis in axes]
+    fails, cells = broken(p, q), [axis[1] - axis[0] for axis in axes]
+    back, every = None, max(1, -(-count // _CHAINS)) if timed else count + 1
     near = [(x >= low - cell) & (x <= high + cell) for x, (low, high), cell in zip((p, q), starts, cells)]
     mass = np.where(near[0] & near[1], 1.0, 0.0)
     wide = _NEAR, _NEAR + int(np.ceil(_FARTHER * noise * np.sqrt(step) / cells[1]))
@@ -157,6 +156,11 @@ def reached(
         least = rising[np.searchsorted(np.cumsum(rising), overlooked / (count + 1))]
         seen = (mass >= least).reshape(_NODES)
         found[k] = maximum_filter(seen, [2 * width + 1 for width in wide])
+        if k % every == 0:
+            chain, _ = _chain(partial(drift, (k + every / 2) * step), noise, axes, (p, q), step)
+            if chain is None:
+                return None
+            back = chain.T.tocsr()
         mass = back @ np.where(fails, 0.0, mass)
     return Reached(axes=axes, seen=found)
 

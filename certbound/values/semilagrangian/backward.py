@@ -72,7 +72,7 @@ class Layout:
 
     def on(self, k: int, seen: Reached) -> Layout:
         """What steps from the k-th time only those cells that paths come to by then."""
-        return self.only(seen.cells(self.frame.y, self.frame.q, self.clock.shear, k))
+        return self.only(seen.cells(self.frame.y, self.frame.q, self.clock.shear, slice(k, k + 1)))
 
     def only(self, cells: Mask) -> Layout:
         """The same, but no cell is stepped save these: the others count as failing above, as not failing below."""

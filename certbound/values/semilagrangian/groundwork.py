@@ -54,7 +54,7 @@ def layouts_of(
 ) -> Iterator[Layout]:
     """Prepare the steps, the last one first; of models that change with time a few at once.
 
-    Blocks in which paths are never ``seen`` are not stepped.
+    Blocks in which paths are not ``seen`` are not stepped.
 
     Raises
     ------
@@ -64,13 +64,14 @@ def layouts_of(
     clock = _clock(setting, plan)
     axes = axes_of(setting, clock, plan, _rough(setting, clock), scout)
     if not setting.timed:
-        yield from _prepared(setting, clock, axes, [clock.begin], seen) * plan.count
+        yield from _prepared(setting, clock, axes, [clock.begin], seen, slice(None)) * plan.count
         return
     begins = [Interval.point(clock.step) * float(k) for k in range(plan.count)]
     size = together(setting, plan.count)
     for last in range(plan.count, 0, -size):
-        part = begins[max(last - size, 0) : last]
-        yield from reversed(_prepared(setting, replace(clock, begin=_hull(part)), axes, part))
+        first = max(last - size, 0)
+        part, when = begins[first:last], slice(first, last + 1)  # with the end: all that is not stepped counts there
+        yield from reversed(_prepared(setting, replace(clock, begin=_hull(part)), axes, part, seen, when))
 
 
 def together(setting: Setting, count: int) -> int:
@@ -92,14 +93,14 @@ def _hull(times: list[Interval]) -> Interval:
 
 
 def _prepared(
-    setting: Setting, clock: Clock, axes: tuple[Array, Array], begins: list[Interval], seen: Reached | None = None
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], begins: list[Interval], seen: Reached | None, when: slice
 ) -> list[Layout]:
-    """One layout for each of the steps' begins; ``clock.begin`` holds them all."""
+    """One layout for each of the steps' begins; ``clock.begin`` holds them all, ``when`` their places and the end."""
     p, q = setting.faces
     index, edges = zip(*(_chunks(axis, count) for axis, count in zip(axes, _BLOCKS)))
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
     if seen is not None:
-        within &= _any_of(seen.cells(*axes, clock.shear), (index[0], index[1]))
+        within &= _any_of(seen.cells(*axes, clock.shear, when), (index[0], index[1]))
     blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
     usable = blocks.known & _gentle(blocks, clock, axes)
     marked = _marked(setting, clock, axes, blocks, usable, (index[0], index[1]), (edges[0], edges[1]))

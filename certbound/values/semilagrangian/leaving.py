@@ -41,15 +41,18 @@ the next.
 """
 _ROUGH = 0.2, (1.0, 0.008, 0.4, 0.12)  # where the model changes with time, and all others take too long
 _BETWEEN = 5
+_GROWTH = 0.12  # of the logarithm of nodes times steps from one plan to the next, about
 _FIRST = 0.25  # share of the work that a first look may take where no scout tells how rare failing is
 _SPARE = 1e-9
 _OVERLOOKED = 1e-8  # what cells that are left out may cost, as a share of a scout's answer
 _CAUTION = 0.1  # for a scout's answer
-_RATE = 800_000
-"""Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes, `_IMAGED`
+_RATE = 1_800_000
+"""Nodes times steps that are done in a second on two cores (`_BESIDE` of that where an obstacle's tolls take the rest);
+`_PREPARED` steps are what preparing the grid takes, `_IMAGED`
 the images of its nodes at one more time.
 """
 _PREPARED, _IMAGED = 20, 11
+_BESIDE = 0.45
 _LEAST, _MOST = 8, 2000
 _PACE = 0.15  # the length of a scout's steps, as those of plans
 
@@ -90,7 +93,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     turn, scout = _turn(setting), scout_of(setting)
     best, least, failed, done = 1.0, 0.0, None, []
     spare = _SPARE if scout is None else _CAUTION * _SHARE * scout.share
-    chosen = _affordable(setting, turn, _RATE * round(seconds, 1), scout)
+    rate = _RATE * (_BESIDE if any(wall.ends() is not None for wall in setting.walls) else 1.0)
+    chosen = _affordable(setting, turn, rate * round(seconds, 1), scout)
     for k, (ratio, cells) in enumerate(chosen):
         plan = _plan(setting, turn, ratio, cells, spare)
         try:
@@ -150,9 +154,12 @@ def _affordable(
     low, high = 0, _BETWEEN * (len(_PLANS) - 1) + 1
     if setting.timed and needed(1) > work:  # the usual case, and every look at a plan costs a second
         return [_graded(0)] if needed(0) <= work else [_ROUGH, _graded(0)]
+    middle = (low + high) // 2
     while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if needed(middle) <= work else (low, middle)
+        found = needed(middle)
+        low, high = (middle, high) if found <= work else (low, middle)
+        away = math.floor(math.log(work / found) / _GROWTH) if found > 0 else high
+        middle = min(max(middle + away, low + 1), high - 1)
     looks = scout is None and low > 0 and 0 < needed(0) < _FIRST * work
     return [_graded(0), _graded(low)] if looks else [_graded(low)]
 
@@ -183,12 +190,12 @@ def _motion(setting: Setting) -> tuple[Callable[[float, Array, Array], Array], C
 
 def _reached(setting: Setting, plan: Plan, scout: Scouted | None) -> Reached | None:
     """Where paths are after so many steps, in floats; None where that is not known."""
-    if scout is None or setting.timed:
+    if scout is None:
         return None
     drift, broken = _motion(setting)
     return reached(
-        partial(drift, 0.0), setting.noise, setting.faces, setting.starts, setting.horizon / plan.count, plan.count,
-        broken, overlooked=_OVERLOOKED * scout.share,
+        drift, setting.noise, setting.faces, setting.starts, setting.horizon / plan.count, plan.count,
+        broken, overlooked=_OVERLOOKED * scout.share, timed=setting.timed,
     )  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -99,7 +98,7 @@ def test_a_band_without_what_is_not_needed_does_the_same(layout, rng) -> None:
 def test_paths_stay_near_what_is_reached(rng) -> None:
     one = setting()
     drift, broken = leaving._motion(one)
-    found = reached(partial(drift, 0.0), one.noise, one.faces, one.starts, 0.05, 20, broken, overlooked=1e-6)
+    found = reached(drift, one.noise, one.faces, one.starts, 0.05, 20, broken, overlooked=1e-6)
     assert found is not None
     axes, seen = found.axes, found.seen
     assert seen[0].mean() < 0.05
