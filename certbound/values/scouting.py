@@ -25,7 +25,7 @@ Ends = tuple[float, float]
 _NODES = (141, 121)
 _KICKS = np.polynomial.hermite_e.hermegauss(5)
 _LEAST = 1e-280
-_NEAR, _FARTHER = 4, 3.2  # nodes, and deviations of a step's noise, around all that paths come to: kicks are bounded
+_NEAR, _FARTHER = 6, 3.2  # nodes, and deviations of a step's noise, around all that paths come to: kicks are bounded
 _CHAINS = 12  # for the times of a model that changes with it, where only that is asked
 _FLAT = 1e-3  # of the least answer: what lies below is flat
 

@@ -291,21 +291,23 @@ def _landed(
     """The smoothed functions at the images of the band's nodes and cells, as ``through`` returns them, law by law."""
     nodes, cells = slice(band.first, band.last + 1), slice(band.first, band.last)
     live, dq = band.live, np.diff(frame.q)
-    image, radius = frame.image[:, nodes], frame.radius[:, nodes]
+    image, radius, slopes, bends, prices = (  # in one piece: else kernels are compiled once more
+        np.ascontiguousarray(part) for part in (
+            frame.image[:, nodes], frame.radius[:, nodes], frame.slopes[:, cells], frame.bends[:, cells], band.prices
+        )
+    )  # fmt: skip
     tables = np.stack([[one.cross_low, one.cross_high, one.steep_y, one.steep_w] for one in laws])
     bend, kinks = np.stack([one.bend for one in laws]), np.stack([one.kinks for one in laws])
     values, arch = np.stack([one.values for one in laws]), np.stack([one.arch for one in laws])
     nodal = at_nodes(image, radius, _touched(live), *mesh, values, arch, tables)
     sagging, sway = np.stack([one.sagging for one in laws]), np.stack([one.sway for one in laws])
-    curve, extra = along_q(
-        image, radius, live, frame.bends[2:, cells], dq, *mesh, tables, bend, kinks, sagging, sway
-    )
+    curve, extra = along_q(image, radius, live, bends[2:], dq, *mesh, tables, bend, kinks, sagging, sway)
     least = laws[0]
     wide = np.stack([least.bent, least.mixed, least.bowed, least.lean_y, least.lean_q])
     close = np.stack([table for one in laws for table in (one.lift + between, one.near + unseen)])
     payment = over_cells(
-        image, radius, live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), *mesh,
-        tables, bend, kinks, band.reach, band.prices, wide, close,
+        image, radius, live, slopes, bends, (np.diff(frame.y)[cells], dq), *mesh, tables, bend, kinks, band.reach,
+        prices, wide, close,
     )  # fmt: skip
     return nodal, curve, payment + np.maximum(extra[:, :-1], extra[:, 1:])
 

@@ -101,8 +101,8 @@ def test_paths_stay_near_what_is_reached(rng) -> None:
     found = reached(drift, one.noise, one.faces, one.starts, 0.05, 20, broken, overlooked=1e-6)
     assert found is not None
     axes, seen = found.axes, found.seen
-    assert seen[0].mean() < 0.05
-    assert seen[4].mean() < 0.6
+    assert seen[0].mean() < 0.1
+    assert seen[4].mean() < 0.7
     x = np.zeros((2, 20_000))
     for k in range(1, 6):
         x = x + 0.05 * drift(0.0, *x) + np.array([[0.0], [np.sqrt(0.05)]]) * rng.standard_normal(x.shape[1])
@@ -110,3 +110,17 @@ def test_paths_stay_near_what_is_reached(rng) -> None:
         inside = np.all([(i >= 0) & (i < len(axis)) for i, axis in zip(place, axes)], axis=0)
         assert seen[k][tuple(i[inside] for i in place)].all()
         x = x[:, inside]
+
+
+def test_where_the_model_changes_with_time_what_steps_share_is_made_for_their_end_too(monkeypatch) -> None:
+    system = cb.ContinuousSystem(
+        lambda t, x: [x[1], -3 * x[0] - 0.3 * x[1] + 0.3 * np.cos(2 * t)], states=2, diffusion=[[0.0], [0.25]]
+    )
+    safe = [cb.Inside(cb.Box([-1, -2], [1, 2]))]
+    one = setting_of(cb.Problem(system, initial=[0.6, 0], safe=safe, horizon=0.75))
+    plan = replace(PLAN, count=5)
+    scout = leaving.scout_of(one)
+    upper, lower = leaving.bounds_by_steps(one, plan, scout=scout)
+    monkeypatch.setattr(leaving, "_reached", lambda *asked: None)
+    assert leaving.bounds_by_steps(one, plan, scout=scout) == pytest.approx((upper, lower), rel=0.01)
+    assert upper < 1
