@@ -15,13 +15,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from certbound.arrays import Array, Index, Mask
+from certbound.values.grids import corners
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+Ends = tuple[float, float]
+
 _NODES = (141, 121)
 _KICKS = np.polynomial.hermite_e.hermegauss(5)
 _LEAST = 1e-280
+_NEAR, _FARTHER = 6, 3.2  # nodes, and deviations of a step's noise, around all that paths come to: kicks are bounded
+_CHAINS = 12  # for the times of a model that changes with it, where only that is asked
 _FLAT = 1e-3  # of the least answer: what lies below is flat
 
 
@@ -53,7 +58,7 @@ class Scouted:
 
 
 def scouted(
-    drift: Callable[[float, Array, Array], Array], noise: float, faces: tuple[tuple[float, float], tuple[float, float]],
+    drift: Callable[[float, Array, Array], Array], noise: float, faces: tuple[Ends, Ends],
     starts: Array, horizon: float, steps: int, broken: Callable[[Array, Array], Mask], *, timed: bool = False,
 ) -> Scouted | None:  # fmt: skip
     """Follow dp = F dt, dq = g dt + s dW; None where nothing fails or all does, or the drift is undefined.
@@ -108,6 +113,56 @@ def scouted(
     return Scouted(
         p=p, q=q, visits=visits, steep_p=steep_p, steep_q=steep_q, cells=cells, share=float(first.max())
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Reached:
+    """Points of a grid that paths come near before they fail, ``seen`` (K, *grid) at the times 0, step, 2 step, ..."""
+
+    axes: list[Array]
+    seen: Mask
+
+    def cells(self, y: Array, q: Array, shear: float, when: slice) -> Mask:
+        """Which cells of (y, q), p = y + shear q, have such a corner at some of these times."""
+        seen = np.asarray(self.seen[when].any(axis=0))
+        p = y[:, None] + shear * q
+        place = [
+            np.clip(np.rint((x - axis[0]) / (axis[1] - axis[0])), 0, len(axis) - 1).astype(int)
+            for axis, x in zip(self.axes, (p, np.broadcast_to(q, p.shape)))
+        ]
+        return np.asarray(np.logical_or.reduce(corners(seen[tuple(place)])))
+
+
+def reached(
+    drift: Callable[[float, Array, Array], Array], noise: float, faces: tuple[Ends, Ends], starts: tuple[Ends, Ends],
+    step: float, count: int, broken: Callable[[Array, Array], Mask], *, overlooked: float, timed: bool = False,
+) -> Reached | None:  # fmt: skip
+    """What paths from the starts come near in ``count`` steps; None where the drift is undefined.
+
+    ``overlooked``: what all points that are left out may be visited, of a path from every start on the grid.
+    """
+    from scipy.ndimage import maximum_filter
+
+    axes = [np.linspace(*ends, nodes) for ends, nodes in zip(faces, _NODES)]
+    p, q = (part.ravel() for part in np.meshgrid(*axes, indexing="ij"))
+    fails, cells = broken(p, q), [axis[1] - axis[0] for axis in axes]
+    back, every = None, max(1, -(-count // _CHAINS)) if timed else count + 1
+    near = [(x >= low - cell) & (x <= high + cell) for x, (low, high), cell in zip((p, q), starts, cells)]
+    mass = np.where(near[0] & near[1], 1.0, 0.0)
+    wide = _NEAR, _NEAR + int(np.ceil(_FARTHER * noise * np.sqrt(step) / cells[1]))
+    found = np.zeros((count + 1, *_NODES), dtype=bool)
+    for k in range(count + 1):
+        rising = np.sort(mass)
+        least = rising[np.searchsorted(np.cumsum(rising), overlooked / (count + 1))]
+        seen = (mass >= least).reshape(_NODES)
+        found[k] = maximum_filter(seen, [2 * width + 1 for width in wide])
+        if k % every == 0:
+            chain, _ = _chain(partial(drift, (k + every / 2) * step), noise, axes, (p, q), step)
+            if chain is None:
+                return None
+            back = chain.T.tocsr()
+        mass = back @ np.where(fails, 0.0, mass)
+    return Reached(axes=axes, seen=found)
 
 
 def _chain(

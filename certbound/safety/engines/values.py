@@ -48,7 +48,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         if problem.system.time == "continuous" and problem.endless:
             return _lasting(problem)
         if problem.reach is None and serves(problem):
-            return _continuous(_confined(problem, limit) or bound_exits_by_steps(problem, seconds=limit))
+            whole = max(min(limit, _GRANT * seconds_left()), _LEAST)  # one grid: its steps end, or all is lost
+            return _continuous(_confined(problem, limit) or bound_exits_by_steps(problem, seconds=whole))
         if not isinstance(problem.system, DiscreteSystem):
             answer = _continuous(_exits(problem, limit, asked))
             return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer

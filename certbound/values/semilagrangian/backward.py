@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.values.grids import around_nodes, corners
-from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, through
+from certbound.values.scouting import Reached
+from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, narrowed, through
 from certbound.values.semilagrangian.confines import TWICE
+from certbound.values.semilagrangian.local_steps import Clock
 from certbound.values.semilagrangian.mirrors import Mirror
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.obstacles import Catch, Toll
@@ -56,6 +58,32 @@ class Bounds:
     paid: Array | float = 0.0
     tolls: Sequence[Toll] = ()
     catches: Sequence[Catch] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Layout:
+    """All that an induction needs."""
+
+    clock: Clock
+    frame: Frame
+    bands: list[Band]
+    above: Bounds
+    below: Bounds
+
+    def on(self, k: int, seen: Reached) -> Layout:
+        """What steps from the k-th time only those cells that paths come to by then."""
+        return self.only(seen.cells(self.frame.y, self.frame.q, self.clock.shear, slice(k, k + 1)))
+
+    def only(self, cells: Mask) -> Layout:
+        """The same, but no cell is stepped save these: the others count as failing above, as not failing below."""
+        left = around_nodes((self.frame.live & ~cells).astype(float), largest=True) > 0
+        level = np.where(left, np.maximum(self.above.level, 1.0), self.above.level)
+        frame = replace(self.frame, live=self.frame.live & cells)
+        return replace(
+            self, frame=frame, bands=[part for part in (narrowed(band, frame) for band in self.bands) if part],
+            above=replace(self.above, level=level, fixed=self.above.fixed | left),
+            below=replace(self.below, level=np.where(left, 0.0, self.below.level), fixed=self.below.fixed | left),
+        )  # fmt: skip
 
 
 def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines:

@@ -56,14 +56,18 @@ class Frame:
 class Band:
     """Cells ``first:last`` along y; see the module.
 
-    ``two`` holds the kernels along q of the least and the largest variance, ``share`` (cells, nq - 1) where between
-    them a cell's variance is.
+    Rows (a mesh along y) and ``nodes`` of q are what its images fall on, ``lines`` and ``sources`` what is within reach
+    of them. ``two`` holds the kernels along q of the least and the largest variance, ``share`` (cells, nq - 1) where
+    between them a cell's variance is.
     """
 
     first: int
     last: int
     rows: slice
     lines: slice
+    nodes: slice
+    sources: slice
+    sigmas: tuple[float, float]
     one: Along
     two: tuple[Across, Across]
     share: Array
@@ -100,12 +104,10 @@ def band_of(
     sigma = base.sigma, sigmas[0]
     more = np.where(live, (height.hi - held) * _UP + 1e-14 * height.hi, 0.0)
     reach = follow * np.sqrt(excess[0]) * _UP
-    rows = _rows(frame, first, last, live, reach)
+    rows = _touched_places(frame, 0, first, last, live, reach)
     mesh = frame.y[rows]
     margin = (REACH + 0.1) * sigma[0]
-    start = int(np.searchsorted(frame.y, mesh[0] - margin, side="right")) - 1
-    stop = int(np.searchsorted(frame.y, mesh[-1] + margin)) + 1
-    lines = slice(max(start, 0), min(stop, len(frame.y)))
+    lines = _around(frame.y, rows, margin)
     live = live & _far_from_ends(
         frame, first, last, (sigma[0], sigmas[1]), (float(mesh[0]) - margin, float(mesh[-1]) + margin)
     )
@@ -124,9 +126,11 @@ def band_of(
     amplified = [_amplified(frame, slice(first, last), frame.y[lines], mesh, (sigma[0], s), reach) for s in sigmas]
     rounding = error * np.maximum(*amplified)
     prices = np.stack([more / 2, excess[1], excess[0] / 2, drift[0], drift[1], rounding]) * _UP
+    every = slice(0, len(frame.q))
     return Band(
-        first=first, last=last, rows=rows, lines=lines, one=one, two=two, share=share, reach=reach, prices=prices,
-        live=live, beyond=_NEGLECTED / error, apart=(ends[1] - ends[0]) ** 2 / 32 * _UP,
+        first=first, last=last, rows=rows, lines=lines, nodes=every, sources=every, sigmas=(sigma[0], sigmas[1]),
+        one=one, two=two, share=share, reach=reach, prices=prices, live=live, beyond=_NEGLECTED / error,
+        apart=(ends[1] - ends[0]) ** 2 / 32 * _UP,
     )  # fmt: skip
 
 
@@ -191,20 +195,57 @@ def _far_from_ends(
     return found
 
 
-def _rows(frame: Frame, first: int, last: int, live: Mask, reach: Array) -> slice:
-    """The mesh's rows that the band's windows touch, and one more on either side."""
+def narrowed(band: Band, frame: Frame) -> Band | None:
+    """A band without what its cells that are live in a frame do not need; None where none is."""
+    live = band.live & frame.live[band.first : band.last]
+    kept = np.flatnonzero(live.any(axis=1))
+    if not len(kept):
+        return None
+    part = slice(int(kept[0]), int(kept[-1]) + 1)
+    first, last, reach = band.first + part.start, band.first + part.stop, band.reach[part]
+    rows = _touched_places(frame, 0, first, last, live[part], reach)
+    nodes = _touched_places(frame, 1, first, last, live[part], 0.0)
+    lines, sources = (
+        _around(axis, near, (REACH + more) * sigma)
+        for axis, near, more, sigma in zip((frame.y, frame.q), (rows, nodes), (0.1, 1.0), band.sigmas)
+    )
+    lines = slice(max(lines.start, band.lines.start), min(lines.stop, band.lines.stop))
+    return replace(
+        band, first=first, last=last, rows=rows, lines=lines, nodes=nodes, sources=sources,
+        one=band.one.cut(_less(rows, band.rows), _less(lines, band.lines)),
+        two=(band.two[0].cut(nodes, sources), band.two[1].cut(nodes, sources)), share=band.share[part], reach=reach,
+        prices=band.prices[:, part], live=live[part],
+    )  # fmt: skip
+
+
+def _less(part: slice, whole: slice) -> slice:
+    return slice(part.start - whole.start, part.stop - whole.start)
+
+
+def _around(axis: Array, near: slice, margin: float) -> slice:
+    """The nodes within a margin of these, and one more on either side."""
+    start = int(np.searchsorted(axis, axis[near.start] - margin, side="right")) - 1
+    stop = int(np.searchsorted(axis, axis[near.stop - 1] + margin)) + 1
+    return slice(max(start, 0), min(stop, len(axis)))
+
+
+def _touched_places(frame: Frame, axis: int, first: int, last: int, live: Mask, reach: Array | float) -> slice:
+    """The rows (along y, axis 0; not the outermost) or nodes (along q, axis 1) that the windows of cells ``first:last``
+    touch, and one more on either side.
+    """
     d = np.diff(frame.y)[first:last, None]
-    sag = frame.bends[0, first:last] * d**2 / 8 + frame.bends[2, first:last] * np.diff(frame.q) ** 2 / 8
+    sag = frame.bends[axis, first:last] * d**2 / 8 + frame.bends[2 + axis, first:last] * np.diff(frame.q) ** 2 / 8
     low, high = np.inf, -np.inf
-    image, radius = frame.image[0, first : last + 1], frame.radius[0, first : last + 1]
+    image, radius = frame.image[axis, first : last + 1], frame.radius[axis, first : last + 1]
     for a in (slice(None, -1), slice(1, None)):
         for b in (slice(None, -1), slice(1, None)):
             away = radius[a, b] + sag + reach
             low = min(low, float(np.where(live, image[a, b] - away, np.inf).min()))
             high = max(high, float(np.where(live, image[a, b] + away, -np.inf).max()))
-    start = int(np.searchsorted(frame.y, low)) - 2
-    stop = int(np.searchsorted(frame.y, high)) + 2
-    return slice(max(start, 1), min(stop + 1, len(frame.y) - 1))
+    places, least = (frame.y, 1) if axis == 0 else (frame.q, 0)
+    start = int(np.searchsorted(places, low)) - 2
+    stop = int(np.searchsorted(places, high)) + 2
+    return slice(max(start, least), min(stop + 1, len(places) - least))
 
 
 def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array]) -> tuple[Array, Array, Array]:
@@ -216,21 +257,18 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
         `NOWHERE` at nodes of no live cell.
     payment : ndarray, shape (cells, nq - 1)
     """
-    lines, mesh = band.lines, frame.y[band.rows]
-    inner = slice(lines.start, lines.stop - 1)
-    part = Lines(nodal=value.nodal[lines], bend=value.bend[lines])
+    lines, sources = band.lines, band.sources
+    mesh, places = (frame.y[band.rows], frame.q[band.nodes]), (frame.y[lines], frame.q[sources])
+    inner = slice(lines.start, lines.stop - 1), slice(sources.start, sources.stop - 1)
+    part = Lines(nodal=value.nodal[lines, sources], bend=value.bend[lines, inner[1]])
     near = slopes[0][inner], slopes[1][inner]
-    least = smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[0])
+    least = smoothed(part, near, places, mesh, band.one, band.two[0])
     tables = [least]
     if band.apart > 0:
-        tables.append(smoothed(part, near, frame.y[lines], mesh, frame.q, band.one, band.two[1], least))
+        tables.append(smoothed(part, near, places, mesh, band.one, band.two[1], least))
     unseen = float(np.abs(value.nodal).max() + (np.abs(value.bend) * np.diff(frame.q) ** 2).max() / 8) * band.beyond
     between = band.apart * least.fourth  # whatever share of either a cell takes
-    found = [
-        _landed(band, frame, mesh, replace(table, lift=table.lift + between, near=table.near + unseen))
-        for table in tables
-    ]
-    found += found[: 2 - len(found)]
+    at, curve, paid = _landed(band, frame, mesh, tables, between, unseen)
     share, live = band.share, band.live
     nodal = np.full((live.shape[0] + 1, live.shape[1] + 1), NOWHERE)
     bend = np.full((live.shape[0] + 1, live.shape[1]), -np.inf)
@@ -240,32 +278,38 @@ def through(band: Band, frame: Frame, value: Lines, slopes: tuple[Array, Array])
         table[place] = np.maximum(table[place], np.where(live, mixed, nothing))
 
     for a in (slice(None, -1), slice(1, None)):
-        raised(bend, (a, slice(None)), found[0][1], found[1][1], -np.inf)
+        raised(bend, (a, slice(None)), curve[0], curve[-1], -np.inf)
         for b in (slice(None, -1), slice(1, None)):
-            raised(nodal, (a, b), found[0][0], found[1][0], NOWHERE)
+            raised(nodal, (a, b), at[0], at[-1], NOWHERE)
     bend = np.where(np.isfinite(bend), bend, 0.0)
-    return nodal, bend, ((1 - share) * found[0][2] + share * found[1][2]) * _UP
+    return nodal, bend, ((1 - share) * paid[0] + share * paid[-1]) * _UP
 
 
-def _landed(band: Band, frame: Frame, mesh: Array, found: Rows) -> tuple[Array, Array, Array]:
-    """The smoothed function of one kernel at the images of the band's nodes and cells, as ``through`` returns it."""
+def _landed(
+    band: Band, frame: Frame, mesh: tuple[Array, Array], laws: list[Rows], between: Array, unseen: float
+) -> tuple[Array, Array, Array]:
+    """The smoothed functions at the images of the band's nodes and cells, as ``through`` returns them, law by law."""
     nodes, cells = slice(band.first, band.last + 1), slice(band.first, band.last)
-    image, radius = frame.image[:, nodes], frame.radius[:, nodes]
-    tables = np.stack([found.cross_low, found.cross_high, found.steep_y, found.steep_w])
-    wanted = _touched(band.live)
-    nodal = at_nodes(image, radius, wanted, mesh, frame.q, found.values, found.arch, tables[2:])
-    dq = np.diff(frame.q)
-    bend, extra = along_q(
-        image, radius, band.live, frame.bends[2:, cells], dq, mesh, frame.q, tables, found.bend, found.kinks,
-        (found.sagging, found.sway),
+    live, dq = band.live, np.diff(frame.q)
+    image, radius, slopes, bends, prices = (  # in one piece: else kernels are compiled once more
+        np.ascontiguousarray(part) for part in (
+            frame.image[:, nodes], frame.radius[:, nodes], frame.slopes[:, cells], frame.bends[:, cells], band.prices
+        )
     )  # fmt: skip
-    wide = np.stack([found.bent, found.mixed, found.bowed])
-    close = np.stack([found.lean_y, found.lean_q, found.lift, found.near])
+    tables = np.stack([[one.cross_low, one.cross_high, one.steep_y, one.steep_w] for one in laws])
+    bend, kinks = np.stack([one.bend for one in laws]), np.stack([one.kinks for one in laws])
+    values, arch = np.stack([one.values for one in laws]), np.stack([one.arch for one in laws])
+    nodal = at_nodes(image, radius, _touched(live), *mesh, values, arch, tables)
+    sagging, sway = np.stack([one.sagging for one in laws]), np.stack([one.sway for one in laws])
+    curve, extra = along_q(image, radius, live, bends[2:], dq, *mesh, tables, bend, kinks, sagging, sway)
+    least = laws[0]
+    wide = np.stack([least.bent, least.mixed, least.bowed, least.lean_y, least.lean_q])
+    close = np.stack([table for one in laws for table in (one.lift + between, one.near + unseen)])
     payment = over_cells(
-        image, radius, band.live, frame.slopes[:, cells], frame.bends[:, cells], (np.diff(frame.y)[cells], dq), mesh,
-        frame.q, tables, found.bend, found.kinks, band.reach, band.prices, wide, close,
+        image, radius, live, slopes, bends, (np.diff(frame.y)[cells], dq), *mesh, tables, bend, kinks, band.reach,
+        prices, wide, close,
     )  # fmt: skip
-    return nodal, bend, payment + np.maximum(extra[:-1], extra[1:])
+    return nodal, curve, payment + np.maximum(extra[:, :-1], extra[:, 1:])
 
 
 def _touched(live: Mask) -> Mask:

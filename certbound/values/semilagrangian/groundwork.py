@@ -16,8 +16,8 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.series import ZERO
 from certbound.values.discrete import evaluate
 from certbound.values.grids import Grid
-from certbound.values.scouting import Scouted
-from certbound.values.semilagrangian.backward import Bounds, bounds_below, levels_above
+from certbound.values.scouting import Reached, Scouted
+from certbound.values.semilagrangian.backward import Bounds, Layout, bounds_below, levels_above
 from certbound.values.semilagrangian.bands import Band, Frame, band_of
 from certbound.values.semilagrangian.confines import Wall
 from certbound.values.semilagrangian.flows import flow, sheared
@@ -49,19 +49,12 @@ _TOGETHER, _ALIKE = 8, 0.45
 Images = tuple[Array, Array, Mask]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Layout:
-    """All that an induction needs."""
-
-    clock: Clock
-    frame: Frame
-    bands: list[Band]
-    above: Bounds
-    below: Bounds
-
-
-def layouts_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> Iterator[Layout]:
+def layouts_of(
+    setting: Setting, plan: Plan, scout: Scouted | None = None, seen: Reached | None = None
+) -> Iterator[Layout]:
     """Prepare the steps, the last one first; of models that change with time a few at once.
+
+    Blocks in which paths are not ``seen`` are not stepped.
 
     Raises
     ------
@@ -71,13 +64,14 @@ def layouts_of(setting: Setting, plan: Plan, scout: Scouted | None = None) -> It
     clock = _clock(setting, plan)
     axes = axes_of(setting, clock, plan, _rough(setting, clock), scout)
     if not setting.timed:
-        yield from _prepared(setting, clock, axes, [clock.begin]) * plan.count
+        yield from _prepared(setting, clock, axes, [clock.begin], seen, slice(None)) * plan.count
         return
     begins = [Interval.point(clock.step) * float(k) for k in range(plan.count)]
     size = together(setting, plan.count)
     for last in range(plan.count, 0, -size):
-        part = begins[max(last - size, 0) : last]
-        yield from reversed(_prepared(setting, replace(clock, begin=_hull(part)), axes, part))
+        first = max(last - size, 0)
+        part, when = begins[first:last], slice(first, last + 1)  # with the end: all that is not stepped counts there
+        yield from reversed(_prepared(setting, replace(clock, begin=_hull(part)), axes, part, seen, when))
 
 
 def together(setting: Setting, count: int) -> int:
@@ -99,12 +93,14 @@ def _hull(times: list[Interval]) -> Interval:
 
 
 def _prepared(
-    setting: Setting, clock: Clock, axes: tuple[Array, Array], begins: list[Interval]
+    setting: Setting, clock: Clock, axes: tuple[Array, Array], begins: list[Interval], seen: Reached | None, when: slice
 ) -> list[Layout]:
-    """One layout for each of the steps' begins; ``clock.begin`` holds them all."""
+    """One layout for each of the steps' begins; ``clock.begin`` holds them all, ``when`` their places and the end."""
     p, q = setting.faces
     index, edges = zip(*(_chunks(axis, count) for axis, count in zip(axes, _BLOCKS)))
     within = _inside(clock.shear, edges[0], edges[1], p, q, whole=False)
+    if seen is not None:
+        within &= _any_of(seen.cells(*axes, clock.shear, when), (index[0], index[1]))
     blocks = blocks_of(setting, clock, edges[0], edges[1], order=_ORDERS[1], wanted=within)
     usable = blocks.known & _gentle(blocks, clock, axes)
     marked = _marked(setting, clock, axes, blocks, usable, (index[0], index[1]), (edges[0], edges[1]))
@@ -245,8 +241,7 @@ def _marked(
     for wall, sizes in zip(setting.walls, measured):
         safe &= wall.safe(sizes, nowhere).reshape(safe.shape)
         broken |= wall.broken(sizes).reshape(safe.shape)
-    first = [_starts(part)[:-1] for part in index]
-    asked = usable & np.logical_or.reduceat(np.logical_or.reduceat(safe, first[0]), first[1], axis=1)
+    asked = usable & _any_of(safe, index)
     for wall, sizes in zip(setting.walls, measured):
         ways = ways_past(setting, clock, blocks, asked, edges, wall)
         paid = np.any([way.paid for way in ways], axis=0) if ways else np.zeros_like(usable)
@@ -270,6 +265,12 @@ def _bent(near: Array) -> Array:
 def _starts(index: Index) -> Index:
     """The first cell of every block, and the number of cells."""
     return np.append(np.flatnonzero(np.diff(index, prepend=-1)), len(index))
+
+
+def _any_of(cells: Mask, index: tuple[Index, Index]) -> Mask:
+    """Blocks some of whose cells are among these."""
+    first = [_starts(part)[:-1] for part in index]
+    return np.asarray(np.logical_or.reduceat(np.logical_or.reduceat(cells, first[0]), first[1], axis=1))
 
 
 def _near_wall(

@@ -8,6 +8,9 @@ a bound of the density, and tau_k (1 - tau_k) a unit of mass; where y_t may vani
 its slope times the range of y. Of a bound that is linear in tau the mean and a sixth of the change are enough, as the
 integral of G(tau, s) (s - 1/2) is tau (1 - tau)/2 times (2 tau - 1)/6.
 Along q the density goes into the parabola, along y it is paid as a constant.
+
+A step smooths with one or two laws of q (`bands`); their tables are stacked along a first axis, as where nodes and
+cells land is the same for all. Neighbours land beside each other, so that the cell of one is looked for from there.
 """
 
 from __future__ import annotations
@@ -19,164 +22,166 @@ from certbound.lazy import compiled, within
 
 
 @within
-def _cell_of(axis: Array, place: float) -> int:
-    low, high = 0, len(axis) - 2
-    while low < high:
-        middle = (low + high + 1) // 2
-        if axis[middle] <= place:
-            low = middle
-        else:
-            high = middle - 1
-    return low
+def _cell_near(axis: Array, place: float, guess: int) -> int:
+    """The cell of an axis in which a place is (the first or last for places beyond), looked for from a guess."""
+    last = len(axis) - 2
+    k = min(max(guess, 0), last)
+    while k > 0 and axis[k] > place:
+        k -= 1
+    while k < last and axis[k + 1] <= place:
+        k += 1
+    return k
 
 
 @within
-def _density(window: Index, tables: Array, rates: Array, bend: Array, share: float) -> float:
-    """sup of the density over a window; ``tables`` cross_low, cross_high, steep_y, steep_w; ``rates`` y_t, w_t ranges.
+def _density(window: Index, tables: Array, rates: Array, bend: Array, found: Array) -> None:
+    """sup of the density over a window, without -W'' w_t^2 and with it: ``found`` (laws, 2).
 
-    The last two of ``rates`` are bounds of |y_tt| and |w_tt|; ``share`` is 1, or 0 to leave -W'' w_t^2 out.
+    ``tables`` cross_low, cross_high, steep_y, steep_w; ``rates`` ranges of y_t and w_t, bounds of |y_tt| and |w_tt|.
     """
     y0, y1, w0, w1 = rates[0], rates[1], rates[2], rates[3]
     largest = max(abs(w0), abs(w1)) ** 2
     smallest = 0.0 if w0 <= 0.0 <= w1 else min(abs(w0), abs(w1)) ** 2
     p = min(min(y0 * w0, y0 * w1), min(y1 * w0, y1 * w1))
     r = max(max(y0 * w0, y0 * w1), max(y1 * w0, y1 * w1))
-    best = -np.inf
+    for n in range(len(found)):
+        found[n, 0], found[n, 1] = -np.inf, -np.inf
     for k in range(window[0], window[1] + 1):
         for c in range(window[2], window[3] + 1):
-            b = share * max(bend[k, c], bend[k + 1, c])
-            a, d = tables[0, k, c], tables[1, k, c]
-            mixed = min(min(a * p, a * r), min(d * p, d * r))
-            total = (b * largest if b > 0 else b * smallest) - 2 * mixed
-            total += tables[2, k, c] * rates[4] + tables[3, k, c] * rates[5]
-            best = max(best, total)
-    return best
+            for n in range(len(found)):
+                b = max(bend[n, k, c], bend[n, k + 1, c])
+                a, d = tables[n, 0, k, c], tables[n, 1, k, c]
+                mixed = min(min(a * p, a * r), min(d * p, d * r))
+                total = tables[n, 2, k, c] * rates[4] + tables[n, 3, k, c] * rates[5] - 2 * mixed
+                found[n, 0] = max(found[n, 0], total)
+                found[n, 1] = max(found[n, 1], total + (b * largest if b > 0 else b * smallest))
 
 
 @within
 def _mean_bent(
-    window: Index, q: Array, ends: tuple[float, float], loose: float, rates: Array, sagging: Array, sway: Array
+    n: int, window: Index, q: Array, ends: tuple[float, float], loose: float, rates: Array, sagging: Array, sway: Array
 ) -> float:
     """Mean and a sixth of the change of a linear bound of -W'' w_t^2 along a side whose image has these ends in w."""
-    count = window[3] - window[2] + 3
-    place, level = np.empty(count), np.full(count, -np.inf)
-    place[0], place[count - 1] = ends[0], ends[1]
-    for n in range(1, count - 1):
-        place[n] = q[min(max(window[2] + n, 0), len(q) - 1)]
-    steep, more = 0.0, 0.0
+    c, d = _cell_near(q, ends[0], window[2]), _cell_near(q, ends[1], window[3])
+    s = min(max((ends[0] - q[c]) / (q[c + 1] - q[c]), 0.0), 1.0)
+    t = min(max((ends[1] - q[d]) / (q[d + 1] - q[d]), 0.0), 1.0)
+    one, two, steep, above, span = -np.inf, -np.inf, 0.0, 0.0, ends[1] - ends[0]
     for k in range(window[0], window[1] + 2):
-        for c in range(window[2], window[3] + 1):
-            more = max(more, sway[k, c])
-            steep = max(steep, abs(sagging[k, c + 1] - sagging[k, c]) / (q[c + 1] - q[c]))
-        for n in range(count):
-            c = min(max(_cell_of(q, place[n]), 0), len(q) - 2)
-            t = min(max((place[n] - q[c]) / (q[c + 1] - q[c]), 0.0), 1.0)
-            level[n] = max(level[n], (1 - t) * sagging[k, c] + t * sagging[k, c + 1])
-    above, span = 0.0, ends[1] - ends[0]
-    for n in range(1, count - 1):
-        t = (place[n] - ends[0]) / span if span != 0.0 else 0.0
-        if 0.0 < t < 1.0:
-            above = max(above, level[n] - (1 - t) * level[0] - t * level[count - 1])
+        one = max(one, (1 - s) * sagging[n, k, c] + s * sagging[n, k, c + 1])
+        two = max(two, (1 - t) * sagging[n, k, d] + t * sagging[n, k, d + 1])
+    more = 0.0
+    for e in range(window[2], window[3] + 1):
+        level, lean = -np.inf, 0.0
+        for k in range(window[0], window[1] + 2):
+            more = max(more, sway[n, k, e])
+            lean = max(lean, abs(sagging[n, k, e + 1] - sagging[n, k, e]))
+            level = max(level, sagging[n, k, e + 1])
+        steep = max(steep, lean / (q[e + 1] - q[e]))
+        share = (q[e + 1] - ends[0]) / span if span != 0.0 else 0.0
+        if 0.0 < share < 1.0:
+            above = max(above, level - (1 - share) * one - share * two)
     above += more + steep * loose
     largest = max(abs(rates[2]), abs(rates[3])) ** 2
     smallest = 0.0 if rates[2] <= 0.0 <= rates[3] else min(abs(rates[2]), abs(rates[3])) ** 2
-    one, two = level[0] + above, level[count - 1] + above
+    one, two = one + above, two + above
     first, last = max(one * largest, one * smallest), max(two * largest, two * smallest)
     return float((first + last) / 2 + abs(last - first) / 6)
 
 
 @within
-def _kinked(window: Index, kinks: Array, mesh: Array, longest: float) -> float:
-    """Upper bound of the sum of the kinks that a path of that length in y crosses within a window."""
-    total, largest, least = 0.0, 0.0, np.inf
-    for k in range(window[0] + 1, window[1] + 1):
-        most = 0.0
-        for c in range(window[2], window[3] + 1):
-            most = max(most, kinks[k, c])
-        total += most
-        largest = max(largest, most)
-        least = min(least, mesh[k + 1] - mesh[k])
-    if largest == 0.0:
-        return 0.0
-    return float(min(total, largest * (1 + np.floor(longest / least * 1.000001))))
-
-
-@within
-def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array) -> float:
+def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array, found: Array) -> None:
     """What kinks that a path crosses lift it above its chord: |y_t| tau (1 - tau) times each, tau where it does.
 
-    ``ends`` holds the ranges of y at both ends. Where y_t may vanish a kink costs its slope times the range of y.
+    ``ends`` holds the ranges of y at both ends. Where y_t may vanish a kink costs its slope times the range of y, and
+    no path of a length crosses more of them than fit into it. ``found`` (laws, 4): that, and room for sums.
     """
-    longest = max(abs(rates[0]), abs(rates[1]))
-    whole = longest * _kinked(window, kinks, mesh, longest)
-    if rates[0] <= 0.0 <= rates[1]:
-        return float(whole)
-    sign = 1.0 if rates[0] > 0.0 else -1.0
-    slow, fast = min(abs(rates[0]), abs(rates[1])), longest
+    for n in range(len(found)):
+        found[n, 0], found[n, 1], found[n, 2], found[n, 3] = 0.0, 0.0, 0.0, 0.0
+    if window[0] == window[1]:
+        return
+    turns, sign = rates[0] <= 0.0 <= rates[1], 1.0 if rates[0] > 0.0 else -1.0
+    slow, fast = min(abs(rates[0]), abs(rates[1])), max(abs(rates[0]), abs(rates[1]))
     start, stop = (ends[0], ends[1]), (ends[2], ends[3])
     if sign < 0.0:
         start, stop = (-ends[1], -ends[0]), (-ends[3], -ends[2])
-    total = 0.0
+    least = np.inf
     for k in range(window[0] + 1, window[1] + 1):
-        most, place = 0.0, sign * mesh[k]
-        for c in range(window[2], window[3] + 1):
-            most = max(most, kinks[k, c])
-        early = max((place - start[1]) / fast, 1 - (stop[1] - place) / slow) - 1e-6
-        late = min((place - start[0]) / slow, 1 - (stop[0] - place) / fast) + 1e-6
-        early, late = max(early, 0.0), min(late, 1.0)
-        if early <= late:
-            nearest = min(max(0.5, early), late)
-            total += most * nearest * (1 - nearest)
-    return float(min(0.25 * whole, longest * total))
+        least = min(least, mesh[k + 1] - mesh[k])
+        share, place = 0.0, sign * mesh[k]
+        if not turns:
+            early = max((place - start[1]) / fast, 1 - (stop[1] - place) / slow) - 1e-6
+            late = min((place - start[0]) / slow, 1 - (stop[0] - place) / fast) + 1e-6
+            early, late = max(early, 0.0), min(late, 1.0)
+            if early <= late:
+                nearest = min(max(0.5, early), late)
+                share = nearest * (1 - nearest)
+        for n in range(len(found)):
+            most = 0.0
+            for c in range(window[2], window[3] + 1):
+                most = max(most, kinks[n, k, c])
+            found[n, 1] += most
+            found[n, 2] = max(found[n, 2], most)
+            found[n, 3] += most * share
+    fit = 1 + np.floor(fast / least * 1.000001)
+    for n in range(len(found)):
+        whole = fast * min(found[n, 1], found[n, 2] * fit)
+        found[n, 0] = whole if turns else min(0.25 * whole, fast * found[n, 3])
 
 
 @within
-def _window(mesh: Array, q: Array, y0: float, y1: float, w0: float, w1: float) -> Index:
-    found = np.empty(4, dtype=np.intp)
-    found[0], found[1] = _cell_of(mesh, y0), _cell_of(mesh, y1)
-    found[2], found[3] = _cell_of(q, w0), _cell_of(q, w1)
-    return found
+def _look(window: Index, mesh: Array, q: Array, ends: Array) -> None:
+    """Set a window to the cells of these ranges of y and w, looked for from where it was."""
+    window[0] = _cell_near(mesh, ends[0], window[0])
+    window[1] = _cell_near(mesh, ends[1], window[0])
+    window[2] = _cell_near(q, ends[2], window[2])
+    window[3] = _cell_near(q, ends[3], window[2])
 
 
 @compiled
 def at_nodes(
-    image: Array, radius: Array, wanted: Mask, mesh: Array, q: Array, values: Array, bend: Array, steep: Array
+    image: Array, radius: Array, wanted: Mask, mesh: Array, q: Array, values: Array, bend: Array, tables: Array
 ) -> Array:
-    """phi0 at the images, from above; ``image`` and ``radius`` (2, nx, nq), ``steep`` (2, rows - 1, nq - 1)."""
-    found = np.zeros(wanted.shape)
+    """phi0 at the images, from above, shape (laws, nx, nq).
+
+    ``image`` and ``radius`` (2, nx, nq), the tables of `Rows` stacked law by law; ``tables`` as in `_density`.
+    """
+    found = np.zeros((len(values), *wanted.shape))
+    k, c = 0, 0
     for i in range(wanted.shape[0]):
         for j in range(wanted.shape[1]):
             if not wanted[i, j]:
                 continue
             y, w = image[0, i, j], image[1, i, j]
-            k, c = _cell_of(mesh, y), _cell_of(q, w)
+            k, c = _cell_near(mesh, y, k), _cell_near(q, w, c)
             d = q[c + 1] - q[c]
             t = min(max((y - mesh[k]) / (mesh[k + 1] - mesh[k]), 0.0), 1.0)
             s = min(max((w - q[c]) / d, 0.0), 1.0)
             arch = s * (1 - s) * d * d / 2
-            low = (1 - s) * values[k, c] + s * values[k, c + 1] + arch * bend[k, c]
-            high = (1 - s) * values[k + 1, c] + s * values[k + 1, c + 1] + arch * bend[k + 1, c]
-            near_y, near_w = 0.0, 0.0
-            for a in range(max(k - 1, 0), min(k + 2, steep.shape[1])):
-                for e in range(max(c - 1, 0), min(c + 2, steep.shape[2])):
-                    near_y, near_w = max(near_y, steep[0, a, e]), max(near_w, steep[1, a, e])
-            found[i, j] = (1 - t) * low + t * high + radius[0, i, j] * near_y + radius[1, i, j] * near_w
+            for n in range(len(values)):
+                low = (1 - s) * values[n, k, c] + s * values[n, k, c + 1] + arch * bend[n, k, c]
+                high = (1 - s) * values[n, k + 1, c] + s * values[n, k + 1, c + 1] + arch * bend[n, k + 1, c]
+                near_y, near_w = 0.0, 0.0
+                for a in range(max(k - 1, 0), min(k + 2, tables.shape[2])):
+                    for e in range(max(c - 1, 0), min(c + 2, tables.shape[3])):
+                        near_y, near_w = max(near_y, tables[n, 2, a, e]), max(near_w, tables[n, 3, a, e])
+                found[n, i, j] = (1 - t) * low + t * high + radius[0, i, j] * near_y + radius[1, i, j] * near_w
     return found
 
 
 @compiled
 def along_q(
     image: Array, radius: Array, live: Mask, bends: Array, dq: Array, mesh: Array, q: Array, tables: Array,
-    bend: Array, kinks: Array, sags: tuple[Array, Array],
+    bend: Array, kinks: Array, sagging: Array, sway: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Per line and cell of the q-axis: the parabola's coefficient and the constant for kinks.
+    """Per law, line and cell of the q-axis: the parabola's coefficient and the constant for kinks.
 
-    ``live`` (cells, nq - 1); ``bends`` (2, cells, nq - 1): |d_qq m|; lines are the cells' ends; ``sags`` as `Rows` has
-    ``sagging`` and ``sway``.
+    ``live`` (cells, nq - 1); ``bends`` (2, cells, nq - 1): |d_qq m|; lines are the cells' ends; the rest as `Rows` has
+    it, stacked law by law.
     """
     lines, columns = image.shape[1], image.shape[2] - 1
-    curve, extra = np.zeros((lines, columns)), np.zeros((lines, columns))
-    rates, places = np.empty(6), np.empty(4)
+    curve, extra = np.zeros((len(bend), lines, columns)), np.zeros((len(bend), lines, columns))
+    rates, places, box, window = np.empty(6), np.empty(4), np.empty(4), np.zeros(4, dtype=np.intp)
+    dense, lifted = np.empty((len(bend), 2)), np.empty((len(bend), 4))
     for i in range(lines):
         for j in range(columns):
             below, above = i > 0 and live[i - 1, j], i < lines - 1 and live[i, j]
@@ -189,22 +194,23 @@ def along_q(
                     size = bends[axis, i - 1, j]
                 if above:
                     size = max(size, bends[axis, i, j])
+                one, two = image[axis, i, j], image[axis, i, j + 1]
                 spare = size * square / 2 + radius[axis, i, j] + radius[axis, i, j + 1]
-                step = image[axis, i, j + 1] - image[axis, i, j]
+                step = two - one
                 rates[2 * axis], rates[2 * axis + 1], rates[4 + axis] = step - spare, step + spare, size * square
-            sag_y = rates[4] / 8 + max(radius[0, i, j], radius[0, i, j + 1])
-            sag_w = rates[5] / 8 + max(radius[1, i, j], radius[1, i, j + 1])
-            y0, y1 = min(image[0, i, j], image[0, i, j + 1]) - sag_y, max(image[0, i, j], image[0, i, j + 1]) + sag_y
-            w0, w1 = min(image[1, i, j], image[1, i, j + 1]) - sag_w, max(image[1, i, j], image[1, i, j + 1]) + sag_w
-            window = _window(mesh, q, y0, y1, w0, w1)
-            ends = (image[1, i, j], image[1, i, j + 1])
-            mean = _mean_bent(window, q, ends, sag_w, rates, sags[0], sags[1])
-            mean += _density(window, tables, rates, bend, 0.0)
-            curve[i, j] = min(mean, _density(window, tables, rates, bend, 1.0)) / square
+                sag = rates[4 + axis] / 8 + max(radius[axis, i, j], radius[axis, i, j + 1])
+                box[2 * axis], box[2 * axis + 1] = min(one, two) - sag, max(one, two) + sag
+            _look(window, mesh, q, box)
             for side in range(2):
                 slack = radius[0, i, j + side]
                 places[2 * side], places[2 * side + 1] = image[0, i, j + side] - slack, image[0, i, j + side] + slack
-            extra[i, j] = _crossed(window, kinks, mesh, places, rates)
+            ends = (image[1, i, j], image[1, i, j + 1])
+            _density(window, tables, rates, bend, dense)
+            _crossed(window, kinks, mesh, places, rates, lifted)
+            for n in range(len(bend)):
+                mean = _mean_bent(n, window, q, ends, sag, rates, sagging, sway)
+                curve[n, i, j] = min(mean + dense[n, 0], dense[n, 1]) / square
+                extra[n, i, j] = lifted[n, 0]
     return curve, extra
 
 
@@ -213,7 +219,7 @@ def over_cells(
     image: Array, radius: Array, live: Mask, slopes: Array, bends: Array, sides: tuple[Array, Array], mesh: Array,
     q: Array, tables: Array, bend: Array, kinks: Array, reach: Array, prices: Array, wide: Array, close: Array,
 ) -> Array:  # fmt: skip
-    """What every cell pays: interpolation along y, the rows' interpolation, covariance, remainder, rounding.
+    """What every cell pays, law by law: interpolation along y, that of the rows, covariance, remainder, rounding.
 
     Parameters
     ----------
@@ -226,11 +232,14 @@ def over_cells(
     reach : (cells, nq - 1)
         How far the covariance's excess is followed along y.
     prices : (6, cells, nq - 1)
-        Of ``wide`` (three: bent, mixed, bowed), and of ``close`` but for its third: lean_y, lean_q, lift (which costs
-        itself), near.
+        Of ``wide`` (bent, mixed, bowed, lean_y, lean_q: of all laws) and of the last of ``close``.
+    close : (2 laws, rows - 1, nq - 1)
+        lift, which costs itself, and near, law by law.
     """
-    found = np.zeros(live.shape)
-    rates, ends, places = np.empty(6), np.empty(4), np.empty(4)
+    found = np.zeros((len(bend), *live.shape))
+    rates, ends, places, window = np.empty(6), np.empty(4), np.empty(4), np.zeros(4, dtype=np.intp)
+    dense, lifted, tops = np.empty((len(bend), 2)), np.empty((len(bend), 4)), np.empty(max(len(wide), len(close)))
+    leans, bents = wide[3:], wide[:3]
     for i in range(live.shape[0]):
         for j in range(live.shape[1]):
             if not live[i, j]:
@@ -246,26 +255,34 @@ def over_cells(
                 ends[2 * axis], ends[2 * axis + 1] = low - sag, high + sag
                 rates[2 * axis], rates[2 * axis + 1] = d * slopes[2 * axis, i, j], d * slopes[2 * axis + 1, i, j]
                 rates[4 + axis] = bends[axis, i, j] * d * d
-            window = _window(mesh, q, ends[0], ends[1], ends[2], ends[3])
+            _look(window, mesh, q, ends)
             for a in range(2):
                 slack = bends[2, i, j] * e * e / 8 + max(radius[0, i + a, j], radius[0, i + a, j + 1])
                 places[2 * a] = min(image[0, i + a, j], image[0, i + a, j + 1]) - slack
                 places[2 * a + 1] = max(image[0, i + a, j], image[0, i + a, j + 1]) + slack
-            total = max(_density(window, tables, rates, bend, 1.0), 0.0) / 8
-            total += _crossed(window, kinks, mesh, places, rates)
-            total += _largest(window, close[2]) + prices[5, i, j] * _largest(window, close[3])
-            total += prices[3, i, j] * _largest(window, close[0]) + prices[4, i, j] * _largest(window, close[1])
-            window = _window(mesh, q, ends[0] - reach[i, j], ends[1] + reach[i, j], ends[2], ends[3])
-            for part in range(3):
-                total += prices[part, i, j] * _largest(window, wide[part])
-            found[i, j] = total
+            _density(window, tables, rates, bend, dense)
+            _crossed(window, kinks, mesh, places, rates, lifted)
+            _largest(window, leans, tops)
+            shared = prices[3, i, j] * tops[0] + prices[4, i, j] * tops[1]
+            _largest(window, close, tops)
+            for n in range(len(bend)):
+                total = max(dense[n, 1], 0.0) / 8 + lifted[n, 0] + tops[2 * n] + prices[5, i, j] * tops[2 * n + 1]
+                found[n, i, j] = total + shared
+            ends[0], ends[1] = ends[0] - reach[i, j], ends[1] + reach[i, j]
+            _look(window, mesh, q, ends)
+            _largest(window, bents, tops)
+            shared = prices[0, i, j] * tops[0] + prices[1, i, j] * tops[1] + prices[2, i, j] * tops[2]
+            for n in range(len(bend)):
+                found[n, i, j] += shared
     return found
 
 
 @within
-def _largest(window: Index, table: Array) -> float:
-    best = -np.inf
+def _largest(window: Index, tables: Array, tops: Array) -> None:
+    """The largest value of each of the tables over a window."""
+    for n in range(len(tables)):
+        tops[n] = -np.inf
     for k in range(window[0], window[1] + 1):
         for c in range(window[2], window[3] + 1):
-            best = max(best, table[k, c])
-    return best
+            for n in range(len(tables)):
+                tops[n] = max(tops[n], tables[n, k, c])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 
@@ -15,10 +17,10 @@ from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous import ExitBounds
 from certbound.values.grids import around_nodes
-from certbound.values.scouting import Scouted, scouted
-from certbound.values.semilagrangian.backward import Bounds, back, highest, limited, lowest
+from certbound.values.scouting import Reached, Scouted, reached, scouted
+from certbound.values.semilagrangian.backward import Bounds, Layout, back, highest, limited, lowest
 from certbound.values.semilagrangian.carried import bound_carried_exits, carries
-from certbound.values.semilagrangian.groundwork import Layout, layouts_of, nodes_of, together
+from certbound.values.semilagrangian.groundwork import layouts_of, nodes_of, together
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
@@ -39,14 +41,18 @@ the next.
 """
 _ROUGH = 0.2, (1.0, 0.008, 0.4, 0.12)  # where the model changes with time, and all others take too long
 _BETWEEN = 5
+_GROWTH = 0.12  # of the logarithm of nodes times steps from one plan to the next, about
 _FIRST = 0.25  # share of the work that a first look may take where no scout tells how rare failing is
 _SPARE = 1e-9
+_OVERLOOKED = 1e-8  # what cells that are left out may cost, as a share of a scout's answer
 _CAUTION = 0.1  # for a scout's answer
-_RATE = 800_000
-"""Nodes times steps that are done in a second; `_PREPARED` steps are what preparing the grid takes, `_IMAGED`
+_RATE = 1_800_000
+"""Nodes times steps that are done in a second on two cores (`_BESIDE` of that where an obstacle's tolls take the rest);
+`_PREPARED` steps are what preparing the grid takes, `_IMAGED`
 the images of its nodes at one more time.
 """
 _PREPARED, _IMAGED = 20, 11
+_BESIDE = 0.45
 _LEAST, _MOST = 8, 2000
 _PACE = 0.15  # the length of a scout's steps, as those of plans
 
@@ -87,7 +93,8 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
     turn, scout = _turn(setting), scout_of(setting)
     best, least, failed, done = 1.0, 0.0, None, []
     spare = _SPARE if scout is None else _CAUTION * _SHARE * scout.share
-    chosen = _affordable(setting, turn, _RATE * round(seconds, 1), scout)
+    rate = _RATE * (_BESIDE if any(wall.ends() is not None for wall in setting.walls) else 1.0)
+    chosen = _affordable(setting, turn, rate * round(seconds, 1), scout)
     for k, (ratio, cells) in enumerate(chosen):
         plan = _plan(setting, turn, ratio, cells, spare)
         try:
@@ -147,15 +154,26 @@ def _affordable(
     low, high = 0, _BETWEEN * (len(_PLANS) - 1) + 1
     if setting.timed and needed(1) > work:  # the usual case, and every look at a plan costs a second
         return [_graded(0)] if needed(0) <= work else [_ROUGH, _graded(0)]
+    middle = (low + high) // 2
     while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if needed(middle) <= work else (low, middle)
+        found = needed(middle)
+        low, high = (middle, high) if found <= work else (low, middle)
+        away = math.floor(math.log(work / found) / _GROWTH) if found > 0 else high
+        middle = min(max(middle + away, low + 1), high - 1)
     looks = scout is None and low > 0 and 0 < needed(0) < _FIRST * work
     return [_graded(0), _graded(low)] if looks else [_graded(low)]
 
 
 def scout_of(setting: Setting) -> Scouted | None:
     """Where paths that fail go, roughly; None where that is not found."""
+    drift, broken = _motion(setting)
+    steps = min(max(_LEAST, math.ceil(setting.horizon / (_PACE * _turn(setting)))), _MOST // 8)
+    faces, starts, timed = setting.faces, setting.some_starts(), setting.timed
+    return scouted(drift, setting.noise, faces, starts, setting.horizon, steps, broken, timed=timed)
+
+
+def _motion(setting: Setting) -> tuple[Callable[[float, Array, Array], Array], Callable[[Array, Array], Mask]]:
+    """The drift at a time and points, in floats, and which points walls forbid."""
     model = compile_numpy(setting.tape)
 
     def drift(t: float, p: Array, q: Array) -> Array:
@@ -167,9 +185,18 @@ def scout_of(setting: Setting) -> Scouted | None:
             found |= ~wall.safe(wall.sizes(Interval.point(p), Interval.point(q)), np.zeros((1, 1)))
         return found
 
-    steps = min(max(_LEAST, math.ceil(setting.horizon / (_PACE * _turn(setting)))), _MOST // 8)
-    faces, starts, timed = setting.faces, setting.some_starts(), setting.timed
-    return scouted(drift, setting.noise, faces, starts, setting.horizon, steps, broken, timed=timed)
+    return drift, broken
+
+
+def _reached(setting: Setting, plan: Plan, scout: Scouted | None) -> Reached | None:
+    """Where paths are after so many steps, in floats; None where that is not known."""
+    if scout is None:
+        return None
+    drift, broken = _motion(setting)
+    return reached(
+        drift, setting.noise, setting.faces, setting.starts, setting.horizon / plan.count, plan.count,
+        broken, overlooked=_OVERLOOKED * scout.share, timed=setting.timed,
+    )  # fmt: skip
 
 
 def bounds_by_steps(
@@ -187,18 +214,20 @@ def bounds_by_steps(
     """
     values: list[Lines | None] = []
     layout: Layout | None = None
-    for following in layouts or layouts_of(setting, plan, scout):
-        poll("a value function along the flow")
-        sides = [following.above, following.below][: 1 + below]
-        if layout is None:
-            values = [terminal(following, bounds) for bounds in sides]
-        elif following.bands is not layout.bands:  # what a step asks of the function at its end
-            values = [value and limited(following.frame, s, value.nodal, value.bend) for s, value in zip(sides, values)]
-        layout = following
-        values = [value and back(layout.frame, layout.bands, side, value) for side, value in zip(sides, values)]
-        values = [None if value is None or np.abs(value.nodal).max() > _TALLEST else value for value in values]
-        if not any(values):
-            break
+    seen = _reached(setting, plan, scout)
+    with ThreadPoolExecutor(2) as pool:  # compiled kernels and arithmetic of arrays run without the interpreter's lock
+        for k, following in enumerate(layouts or layouts_of(setting, plan, scout, seen)):
+            poll("a value function along the flow")
+            sides = [following.above, following.below][: 1 + below]
+            if layout is None:
+                values = [terminal(following, bounds) for bounds in sides]
+            elif following.bands is not layout.bands:  # what a step asks of the function at its end
+                values = [v and limited(following.frame, side, v.nodal, v.bend) for side, v in zip(sides, values)]
+            layout = following
+            part = layout if seen is None else layout.on(plan.count - 1 - k, seen)
+            values = list(pool.map(partial(_stepped, part), (part.above, part.below), values))
+            if not any(values):
+                break
     assert layout is not None
     upper, lower, rare = 1.0, 0.0, _RARE * plan.count * plan.spare
     if values[0] is not None:
@@ -208,6 +237,14 @@ def bounds_by_steps(
         best = -lowest(layout.frame, values[1], setting.some_starts(), layout.clock.shear)
         lower = max(0.0, best * (1 - 1e-12) - rare)
     return upper, lower
+
+
+def _stepped(layout: Layout, side: Bounds, value: Lines | None) -> Lines | None:
+    """One side, one step back; None where it has grown beyond what is paid for."""
+    if value is None:
+        return None
+    value = back(layout.frame, layout.bands, side, value)
+    return None if np.abs(value.nodal).max() > _TALLEST else value
 
 
 def terminal(layout: Layout, bounds: Bounds) -> Lines:

@@ -51,6 +51,15 @@ class Along:
     wide: csr_array
     error: float
 
+    def cut(self, rows: slice, lines: slice) -> Along:
+        """For some of the rows, from some of the lines."""
+        cells, between = slice(rows.start, rows.stop - 1), slice(lines.start, lines.stop - 1)
+        return Along(
+            rows=self.rows[rows, lines], spread=self.spread[rows, lines], cells=self.cells[cells, lines],
+            ceiling=self.ceiling[cells, lines], density=self.density[cells, lines], mass=self.mass[cells, between],
+            wide=self.wide[cells, between], error=self.error,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Across:
@@ -68,6 +77,22 @@ class Across:
     wide: Array
     error: float
     spans: tuple[tuple[int, int, int, int], ...]
+
+    def cut(self, nodes: slice, sources: slice) -> Across:
+        """For some of the nodes, from some of them."""
+        cells, between = slice(nodes.start, nodes.stop - 1), slice(sources.start, sources.stop - 1)
+        spans = [
+            (max(first, nodes.start) - nodes.start, min(last, nodes.stop) - nodes.start,
+             max(left, sources.start) - sources.start, min(right, sources.stop) - sources.start)
+            for first, last, left, right in self.spans if first < nodes.stop and last > nodes.start
+        ]  # fmt: skip
+        return Across(
+            values=tuple(part[nodes, sources] for part in self.values),
+            parabolas=tuple(part[nodes, between] for part in self.parabolas),
+            sup=tuple(part[cells, between] for part in self.sup), density=self.density[cells, between],
+            fourth=self.fourth[cells, between], mass=self.mass[cells, between], wide=self.wide[cells, between],
+            error=self.error, spans=tuple(span for span in spans if span[2] < span[3]),
+        )  # fmt: skip
 
 
 def along(nodes: Array, sigma: float, spread: float, rows: slice, lines: slice) -> Along:

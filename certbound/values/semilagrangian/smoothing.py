@@ -90,23 +90,24 @@ class Rows:
 
 
 def smoothed(
-    lines: Lines, slopes: tuple[Array, Array], y: Array, mesh: Array, q: Array, one: Along, two: Across,
-    least: Rows | None = None,
+    lines: Lines, slopes: tuple[Array, Array], places: tuple[Array, Array], mesh: tuple[Array, Array], one: Along,
+    two: Across, least: Rows | None = None,
 ) -> Rows:  # fmt: skip
-    """The majorant on the rows at ``mesh``, from the lines at ``y``.
+    """The majorant on the rows and nodes at ``mesh``, from the lines and nodes at ``places``.
 
     Parameters
     ----------
     lines : Lines
-        Those within reach of the rows only.
-    slopes : (ndarray, ndarray), shape (lines - 1, nq - 1)
+        At ``places``: what is within reach only.
+    slopes : (ndarray, ndarray), shape (lines - 1, nodes - 1)
         Bounds of |d_y U|, |d_q U| near every cell.
     least : Rows, optional
         The same with a smaller s_q whose stretch reaches this one's: what depends on second derivatives and dominating
         means alone is then as there.
     """
-    dy, dq, dm = np.diff(y)[:, None], np.diff(q), np.diff(mesh)[:, None]
-    eighth = dq**2 / 8 * _UP
+    dy, dq = np.diff(places[0])[:, None], np.diff(places[1])
+    dm, dw = np.diff(mesh[0])[:, None], np.diff(mesh[1])
+    eighth = dw**2 / 8 * _UP
     u, b = lines.nodal, lines.bend
     spans = two.spans
     v, v1, v2 = (
@@ -128,7 +129,7 @@ def smoothed(
     low, high = _ends(np.minimum, cross) - spare, _ends(np.maximum, cross) + spare
     if least is None:
         tilt = across_by(np.abs(np.diff(slope_u, axis=1)) / dq + np.abs(slope_b) * dq / 2, two.mass, spans)
-        bow = _ends(np.maximum, np.abs(np.diff(slope_u, axis=0))) + np.abs(np.diff(slope_b, axis=0)) * eighth
+        bow = _ends(np.maximum, np.abs(np.diff(slope_u, axis=0))) + np.abs(np.diff(slope_b, axis=0)) * (dq**2 / 8 * _UP)
         size = np.pad(across_by(bow, two.mass, spans), edge)
         bent, mixed, bowed, lean_y, lean_q, quartic = (
             one.ceiling @ across_by(_rising(u, b, dq), two.density, spans) * _UP, (one.mass @ tilt) * _UP,
@@ -140,14 +141,14 @@ def smoothed(
             least.bent, least.mixed, least.bowed, least.lean_y, least.lean_q, least.fourth,
         )  # fmt: skip
     inner = np.maximum(np.maximum(bend[:-1], bend[1:]), bent)
-    rate = np.abs(np.diff(rows, axis=1)) / dq
+    rate = np.abs(np.diff(rows, axis=1)) / dw
     return Rows(
         values=rows, sagging=-(one.rows @ v2), sway=one.rows @ fourth, bend=bend, arch=one.rows @ mean,
         kinks=one.spread @ drop, lift=(one.cells @ np.maximum(drop, 0.0)) * _UP,
         cross_low=low, cross_high=high, bent=bent, mixed=mixed, bowed=bowed,
-        steep_y=_ends(np.maximum, np.abs(np.diff(rows, axis=0)) / dm) + dq / 2 * np.maximum(np.abs(low), np.abs(high)),
-        steep_w=np.maximum(rate[:-1], rate[1:]) + dq / 2 * np.maximum(inner, 0.0),
-        near=_wide(_corners(u) + _sides(np.abs(b)) * eighth, one, two),
+        steep_y=_ends(np.maximum, np.abs(np.diff(rows, axis=0)) / dm) + dw / 2 * np.maximum(np.abs(low), np.abs(high)),
+        steep_w=np.maximum(rate[:-1], rate[1:]) + dw / 2 * np.maximum(inner, 0.0),
+        near=_wide(_corners(u) + _sides(np.abs(b)) * (dq**2 / 8 * _UP), one, two),
         lean_y=lean_y, lean_q=lean_q, fourth=quartic,
     )  # fmt: skip
 
