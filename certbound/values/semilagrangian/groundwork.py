@@ -38,8 +38,7 @@ from certbound.values.semilagrangian.remainders import bowed, level_of
 from certbound.watch import poll
 
 _BLOCKS = (90, 40)
-_ORDERS = (4, 8, 7)
-"""Of Taylor's polynomials in time: for a first look, on blocks, at nodes."""
+_ORDERS = (4, 8, 7)  # of Taylor's polynomials in time: for a first look, on blocks, at nodes
 _MOST_BANDS = 12
 _APART = 0.02  # how far apart the variances of a band's cells may be
 _MOST_REACH = 6
@@ -142,9 +141,7 @@ def _clock(setting: Setting, plan: Plan) -> Clock:
     omega = level_of(plan.spare)
     step = setting.horizon / plan.count
     whole = Interval(0.0, setting.horizon) if setting.timed else ZERO
-    first = Clock(
-        step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega, begin=whole
-    )
+    first = Clock(step=step * (1 + 1e-15), count=plan.count, shear=step / 2, omega=omega, begin=whole)
     blocks = _rough(setting, replace(first, shear=0.0))
     known = blocks.known
     ratio = blocks.covariance[1].mid[known] / blocks.covariance[2].mid[known]
@@ -304,10 +301,8 @@ def _frame(
     images: Images, clock: Clock, axes: tuple[Array, Array], blocks: Blocks, usable: Mask,
     index: tuple[Index, Index], live: Mask,
 ) -> Frame:  # fmt: skip
-    y, q = axes
-    spread = np.ix_(*index)
-    image, radius, known = images
-    mean = blocks.strays.mean
+    (y, q), spread = axes, np.ix_(*index)
+    (image, radius, known), mean = images, blocks.strays.mean
     drift = np.stack([mean[0] + abs(clock.shear) * mean[1], mean[1]])
     zero = np.where(usable, 1.0, 0.0)
     return Frame(

@@ -88,7 +88,7 @@ def _mean_bent(
     return float((first + last) / 2 + abs(last - first) / 6)
 
 
-@within
+@compiled
 def _crossed(window: Index, kinks: Array, mesh: Array, ends: Array, rates: Array, found: Array) -> None:
     """What kinks that a path crosses lift it above its chord: |y_t| tau (1 - tau) times each, tau where it does.
 
