@@ -188,7 +188,7 @@ def _known(given: Steps, weights: Array) -> Interval:
     n = given.setting.dimension
     forms = concatenate([enclosed_side_forms(-np.ones(n), np.ones(n)), given.setting.inside])
     flat = forms.reshape(len(forms), -1)
-    return matmul(Interval.point(np.maximum(weights, 0.0)), flat).reshape(len(weights), n + 1, n + 1)
+    return matmul(Interval.point(weights), flat).reshape(len(weights), n + 1, n + 1)
 
 
 def _largest(given: Steps) -> Interval:
