@@ -41,6 +41,27 @@ def test_constants_that_are_no_floats_are_no_terms() -> None:
     assert given.secants.rows.shape == (1, 4)
 
 
+def test_a_constant_is_all_that_it_may_be() -> None:
+    """exp(9) - sinh(9) - cosh(9) is 0, and known to a few units in the last place of exp(9) alone."""
+    graph = Graph(("t", "x1", "x2"))
+    nine = graph.const(9.0)
+    rest = graph.apply("exp", nine)
+    for part in ("sinh", "cosh"):
+        rest = graph.apply("sub", rest, graph.apply(part, nine))
+    first = graph.apply("add", graph.input(1), rest)
+    outputs = first, graph.input(2)
+    tape = Tape(inputs=graph.inputs, nodes=tuple(graph.nodes), outputs=outputs, shape=(2,))
+    said = stated(of(tape)).secants.matrix[0, 2]
+    assert -1e-9 < said.lo < -1e-13
+    assert 1e-13 < said.hi < 1e-9
+
+
+def test_a_slope_that_hardly_varies_is_an_interval() -> None:
+    given = stated(of(lambda x: [0.5 * x[0] + 1e-13 * np.sin(9 * x[0]), x[1]]))
+    assert len(given.secants.rows) == 0
+    assert 9e-13 < given.secants.matrix[0, 0].width < 2e-12
+
+
 def test_a_long_chain_of_operations_is_one_function() -> None:
     def step(x: Any) -> list[Any]:
         y = x[0]
