@@ -19,7 +19,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.constants.enclosures import enclose
-from certbound.errors import InfeasibleError
+from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model import JUMPS, Node, Tape, jacobian
 from certbound.problem.problem import Problem
 from certbound.quadratic.setting import Setting
@@ -47,7 +47,7 @@ def secants(problem: Problem, setting: Setting, middle: Array) -> Secants:
     EnclosureError
         The model is undefined somewhere in the box, or jumps.
     InfeasibleError
-        More than ``MOST_TERMS`` terms, or a network.
+        More than ``MOST_TERMS`` terms, a slope that is not bounded, or a network.
     """
     tape, n = problem.closed_loop, setting.dimension
     if len(tape.nodes) > _LONGEST:
@@ -61,7 +61,9 @@ def secants(problem: Problem, setting: Setting, middle: Array) -> Secants:
     every = replace(tape, outputs=tuple(range(len(tape.nodes))), shape=(len(tape.nodes),))
     both = stack([whole, about])
     ranges = enclose(every, [both[:, k] for k in range(len(whole))])
-    found = _Forms(n, setting, whole, ranges)
+    if not np.all(np.isfinite(ranges.mag)):
+        raise InfeasibleError("the model overflows in the box that is looked at.")
+    found = _Forms(tape, setting, whole, ranges)
     for index, node in enumerate(tape.nodes):
         found.add(index, node)
     matrix = [(found.form(k) - found.constant(Interval.point(c))) / Interval.point(w)
@@ -75,8 +77,8 @@ def secants(problem: Problem, setting: Setting, middle: Array) -> Secants:
 class _Forms:
     """Every node as a linear form over (z, p), and what bounds the p."""
 
-    def __init__(self, n: int, setting: Setting, whole: Interval, ranges: Interval) -> None:
-        self.n, self.setting, self.whole = n, setting, whole
+    def __init__(self, tape: Tape, setting: Setting, whole: Interval, ranges: Interval) -> None:
+        self.tape, self.n, self.setting, self.whole = tape, setting.dimension, setting, whole
         self.wide, self.about = ranges[0], ranges[1]
         self.nodes: list[Node] = []
         self.bases: list[int] = []  # the node that a node is a function of; -1: of none
@@ -95,13 +97,13 @@ class _Forms:
             raise InfeasibleError("quadratic value bounds in discrete time do not serve networks.")
         wide = self.wide[index]
         bases = {self.bases[arg] for arg in node.args if self.bases[arg] >= 0} if node.op != "input" else {index}
-        fixed = wide.lo == wide.hi or node.op in JUMPS - {"if_else_zero"}  # a jump here has been decided by `enclose`
-        self.bases.append(-1 if fixed else bases.pop() if len(bases) == 1 else index)
-        self.nodes.append(node)
-        if fixed:
+        exact = wide.lo == wide.hi
+        if node.op in JUMPS - {"if_else_zero"} and not exact:  # `enclose` has decided it
+            raise InfeasibleError("the model jumps somewhere in the box that is looked at.")
+        self.bases.append(-1 if exact or not bases else bases.pop() if len(bases) == 1 else index)
+        self.nodes.append(Node("const", value=float(wide.lo)) if exact else node)
+        if self.bases[index] < 0:
             self.known[index] = self.constant(wide)
-            if wide.lo != wide.hi:
-                raise InfeasibleError("the model jumps somewhere in the box that is looked at.")
         elif self.bases[index] == index:
             self.known[index] = self._based(index, node)
 
@@ -123,21 +125,16 @@ class _Forms:
     def _between(self, index: int, *start: int) -> Tape:
         """The function that leads from some nodes to another."""
         nodes, places = [Node("input", (k,)) for k in range(len(start))], {base: k for k, base in enumerate(start)}
-
-        def taken(other: int) -> int:
-            if other not in places:
-                node = self.nodes[other]
-                if self.bases[other] < 0:
-                    node = Node("const", value=float(self.wide[other].lo))
-                node = node._replace(args=tuple(taken(arg) for arg in node.args))
-                nodes.append(node)
-                places[other] = len(nodes) - 1
-            return places[other]
-
-        last = self.nodes[index]
-        last = last._replace(args=tuple(taken(arg) for arg in last.args))
+        live = {index}
+        for other in range(index, -1, -1):
+            if other in live:
+                live.update(arg for arg in self.nodes[other].args if arg not in places)
+        for other in sorted(live):
+            node = self.nodes[other]
+            nodes.append(node._replace(args=tuple(places[arg] for arg in node.args)))
+            places[other] = len(nodes) - 1
         names = tuple(f"a{k}" for k in range(len(start)))
-        return Tape(inputs=names, nodes=(*nodes, last), outputs=(len(nodes),), shape=(1,))
+        return Tape(inputs=names, nodes=tuple(nodes), outputs=(len(nodes) - 1,), shape=(1,))
 
     def _input(self, slot: int) -> Interval:
         if 1 <= slot <= self.n:
@@ -149,17 +146,22 @@ class _Forms:
         return self.constant(middle) + self._term(self.constant(Interval.point((whole - middle).mag)), 1.0)
 
     def _term(self, row: Interval, factor: float) -> Interval:
-        """factor p with a new |p| <= |row|."""
+        """factor p' with |p'| <= |row|, p' a power of two times a new p of size 1, whatever units the model has."""
         if len(self.rows) == MOST_TERMS:
             raise InfeasibleError(f"the model has more than {MOST_TERMS} terms that are not linear.")
+        scale = Interval.point(np.ldexp(1.0, int(np.clip(np.frexp(row.mag.sum())[1], -900, 900))))
         form = np.zeros(self.n + 1 + MOST_TERMS)
-        form[self.n + 1 + len(self.rows)] = factor
-        self.rows.append(row)
+        form[self.n + 1 + len(self.rows)] = (Interval.point(factor) * scale).hi
+        self.rows.append(row / scale)
         return Interval.point(form)
 
     def _bent(self, index: int, args: list[int], function: Tape) -> Interval:
         """A function of other nodes by the means of its slopes."""
-        means = _means(function, self.wide[args], self.about[args])
+        try:
+            means = _means(function, self.wide[args], self.about[args])
+        except EnclosureError as error:
+            what = f"the slope of `{self.tape.describe(index)}` is not bounded in the box that is looked at."
+            raise InfeasibleError(what) from error
         total = self.constant(self.about[index])
         for arg, slope in ((arg, means[k]) for k, arg in enumerate(args)):
             moved = self.form(arg) - self.constant(self.about[arg])

@@ -98,6 +98,8 @@ def bound_steps(
         raise InfeasibleError(f"quadratic value bounds serve at most {MOST_STATES} states, the problem has {n}.")
     if not isinstance(problem.system, DiscreteSystem):
         raise InfeasibleError("these quadratic value bounds need discrete time; the problem is continuous.")
+    if not problem.horizon <= _WINDOWS[-1] * _MOST_WINDOWS:
+        raise InfeasibleError(f"these quadratic value bounds serve at most {_WINDOWS[-1] * _MOST_WINDOWS} steps.")
     refuse(problem)
     until, best = time.perf_counter() + seconds, StepsBound()
     for setting in _settings(problem):
@@ -119,7 +121,7 @@ def bound_steps(
 
 def _ways(walls: tuple[Wall, ...], horizon: int) -> Iterator[tuple[list[tuple[Wall, ...]], int, int]]:
     """Which walls share a V, how long windows are, and how many steps before have an H of their own: cheap first."""
-    windows = sorted({min(length, horizon) for length in _WINDOWS if length * _MOST_WINDOWS >= horizon} or {horizon})
+    windows = sorted({min(length, horizon) for length in _WINDOWS if length * _MOST_WINDOWS >= horizon})
     if len(walls) > 1:
         yield [walls], windows[0], _EACH[0]
     for each in _EACH:
@@ -140,7 +142,7 @@ def _all_proved(
         side, proof = group[0].side if len(group) == 1 else None, None
         other = None if side is None else sides.get((side[0], 1 - side[1]))
         if other is not None:
-            proof = prove_steps(given, group, turned(other.proposal))
+            proof = prove_steps(given, group, turned(other.proposal), until)
             if not (np.isfinite(proof.excess) and _level([proof]) <= (1 - _SAME) * _level([other])):
                 proof = None
         proof = _proved(given, group, steps, window, until) if proof is None else proof
@@ -159,7 +161,7 @@ def _proved(given: Steps, walls: Sequence[Wall], steps: Integers, window: int, u
     if left <= 0:
         return None
     proposal = propose_steps(given, walls, steps, window, seconds=left)
-    proof = None if proposal is None else prove_steps(given, walls, proposal)
+    proof = None if proposal is None else prove_steps(given, walls, proposal, until)
     return proof if proof is not None and np.isfinite(proof.excess) else None
 
 
@@ -182,7 +184,7 @@ def _level(proofs: Sequence[StepProof]) -> float:
     """log10 of the sum at the worst corner of the starts: convex functions are largest at one."""
     with precision():
         corners = [sum(column, arb(0)) for column in zip(*(proof.at_corners() for proof in proofs))]
-        worst = max(upper(value.log() / arb(10).log()) if value > 0 else _SMALLEST for value in corners)
+        worst = max(upper(value.log() / arb(10).log()) if value > 0 else 0.0 for value in corners)  # not so only of NaN
     return min(max(worst, _SMALLEST), 0.0)
 
 
@@ -207,7 +209,8 @@ def _middle(problem: Problem, setting: Setting) -> Array:
     x = problem.initial.hull().mid
     d = np.zeros(0) if box is None else (np.asarray(box.low) + np.asarray(box.high)) / 2
     for t in range(min(int(problem.horizon), 500)):
-        x = np.clip(np.ravel(step(float(t), *x, *d)), setting.center - setting.width, setting.center + setting.width)
+        x = np.nan_to_num(np.ravel(step(float(t), *x, *d)))
+        x = np.clip(x, setting.center - setting.width, setting.center + setting.width)
     return np.asarray(np.clip((x - setting.center) / setting.width, -0.9, 0.9))
 
 
@@ -218,15 +221,17 @@ def _columns(problem: Problem, setting: Setting) -> Array:
     proxy = law.enclosed_covariance() if law.gaussian else Interval.point(np.asarray(law.proxy))
     gain = Interval.point(np.asarray(problem.system.noise_matrix)) / Interval.point(setting.width).reshape(-1, 1)
     wanted = matmul(gain, matmul(proxy, gain.T))
-    sizes = np.abs(np.asarray(problem.system.noise_matrix))
-    noisy = np.flatnonzero(np.diag(sizes @ np.abs(np.asarray(law.proxy)) @ sizes.T) > 0)  # the others have none at all
+    used = np.any(np.asarray(law.proxy) != 0, axis=1)
+    noisy = np.flatnonzero(np.any(np.asarray(problem.system.noise_matrix)[:, used] != 0, axis=1))  # others have none
+    if not len(noisy):
+        raise InfeasibleError("these quadratic value bounds need noise; the problem has none.")
     wanted = wanted[noisy][:, noisy]
     wanted = (wanted + wanted.T) * Interval.point(0.5)
     for inflated in (_INFLATED, 1e-9, 1e-6):
         values, vectors = np.linalg.eigh(wanted.mid * (1 + inflated) + inflated * np.diag(np.diag(wanted.mid)))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         have = matmul(Interval.point(root), Interval.point(root.T))
-        if not len(noisy) or eigenvalue_lower(have - wanted) >= 0:
+        if eigenvalue_lower(have - wanted) >= 0:
             columns = np.zeros((n + 1, len(noisy)))
             columns[noisy] = root
             return columns
@@ -252,7 +257,8 @@ def _sampled(problem: Problem, low: Array, high: Array) -> tuple[Array, Array, A
     d = np.zeros((_PATHS, 0)) if box is None else np.where(rng.random((_PATHS, len(box.low))) < 0.5, box.low, box.high)
     values, vectors = np.linalg.eigh(np.asarray(law.proxy))
     root = np.asarray(problem.system.noise_matrix) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    bottom, top, spread = x.min(axis=0), x.max(axis=0), np.zeros(x.shape[1])
+    hull, spread = problem.initial.hull(), np.zeros(x.shape[1])
+    bottom, top = np.array(hull.lo), np.array(hull.hi)
     for t in range(min(int(problem.horizon), 1000)):
         x = step(float(t), *x.T, *d.T) + rng.standard_normal((_PATHS, root.shape[1])) @ root.T
         x = np.clip(x, low, high)

@@ -20,6 +20,7 @@ horizon.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -33,6 +34,7 @@ from certbound.quadratic.steps.step_program import StepProposal, Steps, beyond
 from certbound.rigor.balls import precision, upper
 from certbound.rigor.definite import eigenvalue_lower
 from certbound.rigor.intervals import Interval, concatenate, matmul
+from certbound.watch import poll
 
 _CHUNK = 256
 _GAPS = (0.0, 1e-9, 1e-6, 1e-4, 1e-2, 0.1)
@@ -64,8 +66,8 @@ class StepProof:
             return [factor * sum((arb(float(value)).exp() for value in column), arb(0)) for column in self.starts.hi.T]
 
 
-def prove_steps(given: Steps, walls: Sequence[Wall], proposal: StepProposal) -> StepProof:
-    """The bound that a proposal gives of leaving through the walls."""
+def prove_steps(given: Steps, walls: Sequence[Wall], proposal: StepProposal, until: float = math.inf) -> StepProof:
+    """The bound that a proposal gives of leaving through the walls; none where it takes longer than ``until``."""
     lifted, n = _convex(proposal), given.setting.dimension
     first = _at(lifted, np.arange(0, given.horizon, lifted.window))
     corners = given.corners
@@ -73,7 +75,7 @@ def prove_steps(given: Steps, walls: Sequence[Wall], proposal: StepProposal) -> 
     excess = math.inf
     if np.all(eigenvalue_lower(first[:, :n, :n]) >= 0):  # a sum of exponentials of convex functions
         gap = max(_gap(given, wall, lifted, place) for place, wall in enumerate(walls))
-        excess = gap if gap == math.inf else _sum_up(gap, _growth(given, lifted))
+        excess = gap if gap == math.inf else _sum_up(gap, _growth(given, lifted, until))
     return StepProof(excess=excess, starts=starts, proposal=lifted)
 
 
@@ -106,10 +108,13 @@ def _at(proposal: StepProposal, steps: Integers) -> Array:
     return np.asarray(proposal.matrices[place] * (1 - share) + proposal.matrices[place + 1] * share)
 
 
-def _growth(given: Steps, proposal: StepProposal) -> float:
+def _growth(given: Steps, proposal: StepProposal, until: float) -> float:
     """A bound of the sum of lam over all steps."""
     total = 0.0
     for first in range(0, given.horizon, _CHUNK):
+        poll("quadratic value bounds")
+        if total == math.inf or time.perf_counter() > until:
+            return math.inf
         total = _sum_up(total, _excess(given, proposal, np.arange(first, min(first + _CHUNK, given.horizon))))
     return total
 
@@ -183,7 +188,7 @@ def _known(given: Steps, weights: Array) -> Interval:
     n = given.setting.dimension
     forms = concatenate([enclosed_side_forms(-np.ones(n), np.ones(n)), given.setting.inside])
     flat = forms.reshape(len(forms), -1)
-    return matmul(Interval.point(np.maximum(weights, 0.0)), flat).reshape(len(weights), n + 1, n + 1)
+    return matmul(Interval.point(weights), flat).reshape(len(weights), n + 1, n + 1)
 
 
 def _largest(given: Steps) -> Interval:
