@@ -47,6 +47,7 @@ _SOON, _AT_LEAST, _NEGLIGIBLE = 32, 1024, 1e-17
 _BETTER, _LESS = 0.9, 0.5  # of the gap, or of the upper bound: what twice as many steps back have to make of it
 _DEAR, _BRIEF = 3, 2.0  # states from which on a step back is dear, and seconds at fixed rates of those that matter
 _CHECKED, _OFTEN = 1.2, 1.04  # steps back between two looks at the bounds, as a ratio; and where looks need no rates
+_NEXT = 0.8  # of the cells of the last grid: those of the next one are smaller
 _ANSWERED = 1.25  # times the ratio asked for, once the probability is low enough and steps are dear
 
 
@@ -90,6 +91,8 @@ def bound_long_run(
     left, best = seconds, None
     tried: list[tuple[float, float, float]] = []
     for share in shares_of(run.work.n, run.work.shocks):
+        if tried and share > _NEXT * tried[-1][0]:
+            continue  # every grid is solved anew over all steps
         layout = run.work.layout(share)
         if layout is None:
             break

@@ -48,6 +48,12 @@ def test_a_thousand_million_steps_cost_what_a_hundred_thousand_cost():
     assert long.upper > short.upper
 
 
+def test_no_grid_is_hardly_finer_than_the_last_one(monkeypatch):
+    monkeypatch.setattr(long_runs, "shares_of", lambda *_: [0.33, 0.3, 0.2])
+    found = bound_long_run(contraction(), ratio=1.00001, seconds=5)
+    assert [share for share, _, _ in found.tried] == [0.33, 0.2]
+
+
 def test_what_starts_see_of_a_step_is_prepared_once_a_grid(monkeypatch):
     made, plain = [], failures.Work.transition
 
