@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array, Integers, Mask
-from certbound.constants.enclosures import bound_supremum, enclose
+from certbound.constants.enclosures import bound_supremum
 from certbound.errors import EngineError
 from certbound.problem.model import Tape, compile_numpy, jacobian, substitute, trace
 from certbound.problem.problem import Problem
@@ -37,7 +37,7 @@ from certbound.reach.nominal import initial_cells
 from certbound.rigor.intervals import Interval, exp, log
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request
 from certbound.safety.engines.barrier_programs import Polynomials
-from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside
+from certbound.safety.engines.gaps import gaps_of, hull_of, lies_inside, range_over
 from certbound.watch import poll
 
 _MOST_STATES = 3
@@ -306,10 +306,8 @@ class _Work:
         start = self._supremum(value, self.start, 0, _anywhere, _TOLERANCE)
         negative = substitute(trace(lambda v: -v[0], {"v": ["v"]}), names, {"v": value})
         exit_ = self._supremum(negative, self.hull, 0, self._leaving, _TOLERANCE)
-        share, exponent = _TOLERANCE / horizon, None
-        if steady:
-            share, exponent = share * math.exp(max(min(start.upper, 0.0), -_LOWEST)), value
-        growth = self._supremum(generator, self.ranges, 1, self._safe, share, exponent)
+        share = _TOLERANCE / horizon * (math.exp(max(min(start.upper, 0.0), -_LOWEST)) if steady else 1.0)
+        growth = self._supremum(generator, self.ranges, 1, self._safe, share, value if steady else None)
         if not (np.isfinite(growth.upper) or steady):  # V is finite everywhere: no other one would help
             raise EngineError(
                 "the dynamics have no finite enclosure near ("
@@ -367,7 +365,7 @@ class _Work:
         slopes, function = [jacobian(factor) for factor in factors], compile_numpy(factors[0])
 
         def bound(boxes: Interval, _: float) -> tuple[Array, Array]:
-            ranges, weights = zip(*(_enclosed(factor, slope, boxes) for factor, slope in zip(factors, slopes)))
+            ranges, weights = zip(*(range_over(factor, slope, boxes) for factor, slope in zip(factors, slopes)))
             upper = ranges[0].hi
             if exponent is not None:
                 with np.errstate(invalid="ignore", over="ignore"):
@@ -392,19 +390,6 @@ class _Work:
         gaps = [gap.over(boxes) for gap in self.gaps]
         near = np.any([gap.hi >= 0 for gap in gaps], axis=0)
         return np.asarray(np.all([gap.lo <= 0 for gap in gaps], axis=0) & near)
-
-
-def _enclosed(tape: Tape, slope: Tape, boxes: Interval) -> tuple[Interval, Array]:
-    """Ranges of a function over boxes, natural and centred, and how much each coordinate adds to them."""
-    middle = Interval.point(boxes.mid)
-    inputs, at = ([part[:, k] for k in range(boxes.shape[1])] for part in (boxes, middle))
-    whole = enclose(tape, inputs, undefined="infinite")[:, 0]
-    gradient = enclose(slope, inputs, undefined="infinite")[:, 0]
-    with np.errstate(invalid="ignore"):
-        centred = enclose(tape, at, undefined="infinite")[:, 0] + (gradient * (boxes - middle)).sum(axis=-1)
-        weights = np.nan_to_num(gradient.mag * boxes.rad, nan=np.inf, posinf=np.inf)
-        low, high = np.fmax(whole.lo, centred.lo), np.fmin(whole.hi, centred.hi)
-    return Interval(np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)), weights
 
 
 def _anywhere(boxes: Interval) -> Mask:

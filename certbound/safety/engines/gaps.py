@@ -1,4 +1,4 @@
-"""A problem's constraints as functions of the state, for branch and bound over boxes."""
+"""A problem's constraints as functions of the state, and ranges of functions, for branch and bound over boxes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.constants.enclosures import split_boxes
+from certbound.constants.enclosures import enclose, split_boxes
+from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Quadratic
 from certbound.rigor.intervals import Interval, sq
@@ -97,3 +98,19 @@ def lies_inside(gaps: list[Gap], box: Interval) -> bool:
             return False
         boxes = split_boxes(boxes, boxes.rad)
     return False
+
+
+def range_over(tape: Tape, slope: Tape, boxes: Interval) -> tuple[Interval, Array]:
+    """Ranges of a function over boxes (N, k), the better of natural and centred ends, and what each coordinate adds.
+
+    ``slope`` is the function's Jacobian. Where it is undefined or jumps the range is infinite.
+    """
+    middle = Interval.point(boxes.mid)
+    inputs, at = ([part[:, k] for k in range(boxes.shape[1])] for part in (boxes, middle))
+    whole = enclose(tape, inputs, undefined="infinite")[:, 0]
+    gradient = enclose(slope, inputs, undefined="infinite")[:, 0]
+    with np.errstate(invalid="ignore"):
+        centred = enclose(tape, at, undefined="infinite")[:, 0] + (gradient * (boxes - middle)).sum(axis=-1)
+        weights = np.nan_to_num(gradient.mag * boxes.rad, nan=np.inf, posinf=np.inf)
+        low, high = np.fmax(whole.lo, centred.lo), np.fmin(whole.hi, centred.hi)
+    return Interval(np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)), weights
