@@ -14,7 +14,7 @@ from certbound.values.semilagrangian.noisy_axis import setting_of
 from certbound.values.semilagrangian.sources import bound_sourced_exits, kinked
 from certbound.values.semilagrangian.sources.drift_cells import drift_cells
 from certbound.values.semilagrangian.sources.ground import Ground, ground_of
-from certbound.values.semilagrangian.sources.marching import _payment, march
+from certbound.values.semilagrangian.sources.marching import march, payment
 from certbound.values.semilagrangian.sources.residuals import residual_bounds
 from certbound.values.semilagrangian.sources.spline_axes import Axis
 
@@ -50,7 +50,8 @@ def test_pieces_are_the_spline() -> None:
         cell, wide = np.repeat(np.arange(8), 2), np.repeat(np.diff(axis.knots), 2)
         low = axis.knots[cell] + np.tile([0.0, 0.3], 8) * wide
         high = low + 0.6 * wide
-        found = np.einsum("nij,nj->ni", axis.pieces(cell, low, high), np.stack([values[k : k + degree + 1] for k in cell]))
+        own = np.stack([values[k : k + degree + 1] for k in cell])
+        found = np.einsum("nij,nj->ni", axis.pieces(cell, low, high), own)
         for t in (0.0, 0.3, 1.0):
             mean = sum(comb(degree, i) * t**i * (1 - t) ** (degree - i) * found[:, i] for i in range(degree + 1))
             assert np.abs(mean - spline(low + t * (high - low))).max() < 1e-13
@@ -150,15 +151,15 @@ def test_paths_leave_where_the_drift_leads_outward() -> None:
     assert (found.levels()[outside] >= 1).all()
 
 
-def test_payments_cover_what_is_lacking() -> None:
+def testpayments_cover_what_is_lacking() -> None:
     rng = np.random.default_rng(3)
     for _ in range(50):
         low = rng.uniform(-0.1, 1.3, 200) * rng.choice([1, 1e-3], 200)
         lacking = rng.normal(size=200)
-        rate, amount = _payment(lacking, low, 1e-2)
+        rate, amount = payment(lacking, low, 1e-2)
         asked = low < 1
         assert (lacking[asked] <= rate * low[asked] + amount + 1e-12).all()
-    assert _payment(np.array([5.0]), np.array([1.0]), 1e-2) == (0.0, 0.0)
+    assert payment(np.array([5.0]), np.array([1.0]), 1e-2) == (0.0, 0.0)
 
 
 def test_what_is_stepped_is_a_supersolution(monkeypatch) -> None:
@@ -181,7 +182,7 @@ def test_what_is_stepped_is_a_supersolution(monkeypatch) -> None:
         worst = [np.where(bounds(early, speed, speed, step)[2] >= 1, 0, bounds(part, speed, speed, step)[0])
                  for part in (late, early)]  # fmt: skip
         low = np.minimum(bounds(late, speed, speed, step)[2], bounds(early, speed, speed, step)[2])
-        paid = _payment(np.where(low >= 1, 0.0, np.maximum(*worst)), low, 1e-2)
+        paid = payment(np.where(low >= 1, 0.0, np.maximum(*worst)), low, 1e-2)
         total, rate, amount = total + step, rate + paid[0] * step, amount + paid[1] * step
         outside = found.outside()
         assert (early[outside] >= 1).all()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags, eye, kron
 
 from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
@@ -19,6 +19,9 @@ from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.sources.drift_cells import DriftCells, drift_cells
 from certbound.values.semilagrangian.sources.residuals import residual_bounds
 from certbound.values.semilagrangian.sources.spline_axes import Axis
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 _ALONG = 0.002, 0.1, 0.02
 """Cells along p: at its faces, how they grow with the distance, and the widest; in units of half the safe set."""
@@ -213,6 +216,8 @@ def _turn(tape: Tape, p: Axis, q: Axis, noise: float) -> csr_matrix:
     Along p they are one-sided beside its faces, and elsewhere central with a fourth difference that damps what the
     grid does not resolve; along q central, with more noise where a cell would hold too little.
     """
+    from scipy.sparse import csr_matrix, diags, eye, kron
+
     place = np.meshgrid(p.places, q.places, indexing="ij")
     flat = [part.ravel() for part in place]
     drift = np.broadcast_to(compile_numpy(tape)(0.0, *flat), (len(flat[0]), 2))

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags, eye
-from scipy.sparse.linalg import splu
 
 from certbound.arrays import Array, Index, Mask
 from certbound.errors import InfeasibleError
@@ -71,6 +69,9 @@ def march(ground: Ground, horizon: float, guess: float, *, steady: bool = False)
     InfeasibleError
         Nothing is proved.
     """
+    from scipy.sparse import csr_matrix, diags, eye
+    from scipy.sparse.linalg import splu
+
     bounds, fixed = ground.measure(), ground.outside()
     turn = csr_matrix(diags((~fixed).ravel().astype(float)) @ ground.turn)
     sides = _Sides(fixed=fixed, firsts=np.flatnonzero(np.diff(ground.parts[0], prepend=-1)),
@@ -86,7 +87,7 @@ def march(ground: Ground, horizon: float, guess: float, *, steady: bool = False)
         moved = np.where(fixed, now, inverse.solve((now + step * source).ravel()).reshape(now.shape))
         ends = [bounds(part, (now - moved) / step, source, step) for part in (now, moved)]
         low = np.minimum(ends[0][2], ends[1][2])
-        paid = _payment(np.maximum(ends[0][0], ends[1][0]), low, guess)
+        paid = payment(np.maximum(ends[0][0], ends[1][0]), low, guess)
         if early and count >= _GRADES * _EACH:
             amount = max(0.0, -float(ends[0][2].min()))
             early = (paid[0] + paid[1] / guess) * step + amount / guess >= _DEAR and count < _SETTLED
@@ -115,7 +116,7 @@ def _weights(bounds: Any, fixed: Mask) -> Array:
     return np.asarray(np.maximum(bounds(values, values, values, 1.0)[2], _LEAST))
 
 
-def _payment(lacking: Array, low: Array, guess: float) -> tuple[float, float]:
+def payment(lacking: Array, low: Array, guess: float) -> tuple[float, float]:
     """(rate, amount) with R <= rate U + amount on every part, or U >= 1 there."""
     lacking = np.where(low >= 1, 0.0, lacking)
     known = low > _RARE * guess

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.sparse import csr_matrix
 
 from certbound.arrays import Array, Index
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -44,6 +46,9 @@ class Axis:
 
     def differences(self, order: int) -> csr_matrix:
         """From coefficients to the derivative at `places`."""
+        from scipy.interpolate import BSpline
+        from scipy.sparse import csr_matrix
+
         basis = BSpline(self.clamped, np.eye(self.size), self.degree)
         return csr_matrix(basis(self.places, nu=order))
 
