@@ -16,6 +16,7 @@ from certbound.values.continuous import ExitBounds
 from certbound.values.semilagrangian.noisy_axis import Setting
 from certbound.values.semilagrangian.sources.ground import Ground, cells_of, ground_of
 from certbound.values.semilagrangian.sources.marching import march
+from certbound.watch import OutOfTime
 
 _KINKS = {"abs", "min", "max", "kink", "clip"}
 _RATE = 450_000  # cells times steps in a second
@@ -49,7 +50,12 @@ def bound_sourced_exits(setting: Setting, *, seconds: float) -> ExitBounds:
     work = _RATE * seconds
     rough = [_bound(one, _affordable(one, _LOOK * work), _GUESS) for one in _narrower(setting)]
     best, setting = min(((found[0], one) for found, one in zip(rough, _narrower(setting))), key=lambda pair: pair[0])
-    upper, ground = _bound(setting, _affordable(setting, work), max(min(best / 3, _GUESS), 1e-12))
+    try:
+        upper, ground = _bound(setting, _affordable(setting, work), max(min(best / 3, _GUESS), 1e-12))
+    except OutOfTime:
+        if not best < 1:
+            raise
+        upper, ground = 1.0, None
     if ground is None and not best < 1:
         raise InfeasibleError("sources do not settle; value functions prove nothing here.")
     upper = min(upper, best)
