@@ -144,6 +144,8 @@ def test_paths_leave_where_the_drift_leads_outward() -> None:
     assert (found.exits[1] == (middle > 0)).all()
     still = ground_of(setting(lambda x: [0 * x[1], -abs(x[1])]), 3.0)
     assert still.exits[0].all()  # who does not move may touch the face
+    led = ground_of(setting(lambda x: [x[1] - 9 * np.sign(x[0] - 0.5), -x[0]], side=0.5, speed=2.0), 3.0)
+    assert led.exits[1].all()  # its drift points outward up to the face, if not on it
     outside = found.outside()
     for row, leaving in zip((0, -1), found.exits):
         for k in np.flatnonzero(leaving):

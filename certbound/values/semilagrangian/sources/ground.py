@@ -139,12 +139,13 @@ def ground_of(setting: Setting, grain: float) -> Ground:
     q = Axis(
         knots=graded_axis(q0, q1, places, grain * np.minimum(beside * tall + more * near, most * tall), marks), degree=3
     )
-    exits = _exits(setting.tape, p0, q.knots, -1.0), _exits(setting.tape, p1, q.knots, 1.0)
+    beside_faces = (p0, float(p.knots[1])), (p1, float(p.knots[-2]))
+    exits = [_exits(setting.tape, ends, q.knots, sign) for ends, sign in zip(beside_faces, (-1.0, 1.0))]
     step = grain * _step(setting)
     noise = setting.noise**2 * (1 + 2 * setting.spread)
     return Ground(
-        p=p, q=q, cells=drift_cells(setting.tape, p.knots, q.knots), exits=exits, turn=_turn(setting.tape, p, q, noise),
-        step=step, noise=noise,
+        p=p, q=q, cells=drift_cells(setting.tape, p.knots, q.knots), exits=(exits[0], exits[1]),
+        turn=_turn(setting.tape, p, q, noise), step=step, noise=noise,
         real=tuple(tuple(math.isfinite(end) for end in ends) for ends in setting.beyond),  # type: ignore[arg-type]
         turns=np.array([marks[0], marks[-1]] if marks else [np.inf, np.inf]),
     )  # fmt: skip
@@ -189,21 +190,24 @@ def _rate(setting: Setting) -> float:
     return max(float(np.quantile(np.abs(np.linalg.eigvals(slopes)).max(axis=1), 0.9)), 1e-3 / setting.horizon)
 
 
-def _exits(tape: Tape, face: float, q: Array, sign: float) -> Mask:
+def _exits(tape: Tape, ends: tuple[float, float], q: Array, sign: float) -> Mask:
     """Cells along q of one of p's faces that hold every point of it through which a path may leave.
 
     Who leaves at a point has a drift outward there, or none. A cell on which the drift leads nowhere outward, and
-    vanishes at most at one of its ends, is left out if the end's other cell is not.
+    vanishes at most at one of its ends, is left out if the end's other cell is not. ``ends`` are the face and the next
+    knot of p: where something jumps in between, what leads to the face counts.
     """
-    still = Interval.point(np.zeros(1))
+    still, face = Interval.point(np.zeros(1)), ends[0]
     sides = [Interval.point(np.full(len(q) - 1, face)), Interval(q[:-1], q[1:])]
-    ranges, _, jumps = evaluate(tape, [still, *sides])
+    ranges = evaluate(tape, [still, *sides])[0]
+    across = Interval(np.full(len(q) - 1, min(ends)), np.full(len(q) - 1, max(ends)))
+    jumps = evaluate(tape, [still, across, sides[1]])[2]
     drift = sign * ranges[:, 0]
     slopes, _, broken = evaluate(jacobian(tape, (1, 2)), [still, *sides])
     strict = (slopes[:, 1].lo > 0) | (slopes[:, 1].hi < 0)
     found = np.asarray((drift.hi > 0) | ((drift.hi == 0) & ~strict) | jumps | broken)
-    ends = sign * evaluate(tape, [still, Interval.point(np.full(len(q), face)), Interval.point(q)])[0][:, 0]
-    for k in np.flatnonzero(ends.hi >= 0):
+    nodes = sign * evaluate(tape, [still, Interval.point(np.full(len(q), face)), Interval.point(q)])[0][:, 0]
+    for k in np.flatnonzero(nodes.hi >= 0):
         around = [j for j in (k - 1, k) if 0 <= j < len(found)]
         if not found[around].any():
             found[around] = True
