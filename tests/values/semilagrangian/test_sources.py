@@ -196,6 +196,27 @@ def test_what_is_stepped_is_a_supersolution(monkeypatch) -> None:
 
 
 @pytest.mark.slow
+def test_both_ends_of_a_step_are_paid(monkeypatch) -> None:
+    found, calls = ground_of(setting(servo, horizon=0.2), 3.0), []
+    bounds, guess = found.measure(), 1e-2
+
+    def proved(extra):
+        def watched(*inputs):
+            calls.append(inputs[3])
+            most, *rest = bounds(*inputs)
+            return most + (0.5 if len(calls) == extra else 0.0), *rest
+
+        calls.clear()
+        monkeypatch.setattr(Ground, "measure", lambda self: watched)
+        paid = march(found, 0.2, guess)
+        return paid.rate + paid.amount
+
+    plain = proved(0)
+    count = len(calls)
+    for last in (count - 1, count):  # the ends of the last step
+        assert proved(last) > plain + 0.1 * calls[-1]
+
+
 def test_servo_that_saturates() -> None:
     found = bound_sourced_exits(setting(servo, start=(0.3, 0.9)), seconds=5.0)
     assert 0.198 < 10**found.upper < 0.4  # .199 simulated
