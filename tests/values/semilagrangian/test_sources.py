@@ -195,7 +195,6 @@ def test_what_is_stepped_is_a_supersolution(monkeypatch) -> None:
     assert proved.amount >= amount * (1 - 1e-9) + max(0.0, -bounds(late, speed, speed, step)[2].min()) * (1 - 1e-9)
 
 
-@pytest.mark.slow
 def test_both_ends_of_a_step_are_paid(monkeypatch) -> None:
     found, calls = ground_of(setting(servo, horizon=0.2), 3.0), []
     bounds, guess = found.measure(), 1e-2
@@ -217,6 +216,7 @@ def test_both_ends_of_a_step_are_paid(monkeypatch) -> None:
         assert proved(last) > plain + 0.1 * calls[-1]
 
 
+@pytest.mark.slow
 def test_servo_that_saturates() -> None:
     found = bound_sourced_exits(setting(servo, start=(0.3, 0.9)), seconds=5.0)
     assert 0.198 < 10**found.upper < 0.4  # .199 simulated
