@@ -368,12 +368,16 @@ def test_a_timer_that_another_thread_hears_waits_until_what_must_not_be_interrup
     begun, done = threading.Event(), []
     other = threading.Thread(target=lambda: begun.wait() and signal.raise_signal(signal.SIGALRM))
     other.start()
-    with pytest.raises(OutOfTime), Watch(20.0).running():
+
+    def work() -> None:
         with undisturbed():
             begun.set()
             other.join()
             done.append("whole")
         time.sleep(5)
+
+    with pytest.raises(OutOfTime), Watch(20.0).running():
+        work()
     assert done == ["whole"]
 
 

@@ -232,7 +232,8 @@ class Remainder(Derivatives):
             else:
                 excess = asked.excess(lo, hi, inner_lo, inner_hi, items, expansion.nominal)
             largest = excess.max(axis=1)
-            moving = np.isinf(before) | expansion.model.planar  # planes may need cuts on both sides to come closer
+            # planes may need cuts on both sides to come closer, and what lies beyond kinks is culled late
+            moving = np.isinf(before) | expansion.model.planar | expansion.model.kinked
             worst = (largest > 0) & ((largest < _STALLED * before) | moving)
             if alone:
                 worst &= (np.bincount(items[worst], minlength=m) <= _CROWD)[items]
