@@ -387,7 +387,7 @@ def test_on_a_scouted_grid_the_bounds_hold() -> None:
     plan = replace(COARSE, count=15, loss=0.01, cell=0.3)
     seeing = next(layouts_of(setting, plan, leaving.scout_of(setting)))
     share, error = simulated(problem, 3_000, rng)
-    upper, lower = bound_by_steps(setting, plan, seeing), bound_by_steps_below(setting, plan, seeing)
+    upper, lower = bounds_by_steps(setting, plan, layouts=[seeing] * plan.count)
     assert lower - 4 * error < share < upper + 4 * error
     assert lower < upper < 2.5 * lower
 
