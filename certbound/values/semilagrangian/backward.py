@@ -125,7 +125,7 @@ def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:
     full = np.minimum.reduce(corners(raised)) >= cap
     capped = (around_nodes((~full).astype(float), largest=True) <= 0) & (bounds.level <= cap)
     nodal = np.where(capped, cap, raised)
-    sides, beside = fixed[:, :-1] | fixed[:, 1:], over_corners(np.maximum, capped)
+    sides, beside = fixed[:, :-1] | fixed[:, 1:], over_corners(np.maximum, capped.astype(float)) > 0
     sides[:-1] |= beside
     sides[1:] |= beside
     bend = np.where(sides, np.maximum(bend, 0.0), bend)
