@@ -34,6 +34,8 @@ def _floats(name: str, value: Any) -> Array:
     try:
         raw = np.asarray(value)
         array = np.asarray(raw, dtype=float) if raw.dtype.kind in "biufO" else None
+    except OverflowError as error:
+        raise ValueError(f"`{name}` must hold numbers of at most 1.8e308 in size.") from error
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must hold numbers, got {value!r}.") from error
     if array is None or value is None:

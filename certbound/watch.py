@@ -79,7 +79,7 @@ class Watch:
         self, limit: float | None = None, *, progress: Callable[[Progress], object] | None = None,
         clock: Callable[[], float] = time.perf_counter, jobs: int = 1, executor: Any = None, patient: bool = False,
     ) -> None:
-        if limit is not None and not (isinstance(limit, (int, float)) and limit > 0):
+        if limit is not None and not (isinstance(limit, (int, float)) and 0 < limit < math.inf):
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
         if isinstance(jobs, bool) or int(jobs) != jobs or jobs < 1:
             raise ValueError(f"`jobs` must be a positive number of processes, got {jobs!r}.")

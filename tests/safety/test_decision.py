@@ -315,7 +315,7 @@ def test_a_share_of_time_ends_quietly_and_the_whole_does_not(clock: Time) -> Non
     assert seconds_left() == float("inf")
 
 
-@pytest.mark.parametrize("limit", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("limit", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_limit_must_be_positive(limit: float) -> None:
     with pytest.raises(ValueError, match="`time_limit` must be a positive number of seconds"):
         cb.verify_safety(problem(), time_limit=limit)
