@@ -10,6 +10,7 @@ the proof is `hypotheses.proved_upper`, which asks for V >= 0 on the faces and f
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -39,12 +40,13 @@ Other = Callable[[float, float], Found]
 
 _OVER = 0.3  # V up to which sources work
 _TOP = -0.003  # where V is above on all of a patch no source is asked for: corners would swing, and a lift does it
-_GRANT = 2.1  # times the patches that seconds stand for elsewhere: one side is looked for, on one grid
-_PASSES = 3  # that are proved
+_GRANT = 1.7  # times the patches that seconds stand for elsewhere: one side is looked for, on one grid
+_PASSES = 4  # that are proved
 _FACTOR = 1.12
 _CAP = 50.0
 _GRANTED = 0.003  # eps that the proof may pay, in units of the bound, summed over the horizon
 _HOPELESS = 6.0  # what a corrected proposal may lose (log P)
+_LITTLE = 0.1  # of log P: where a pass gains less, the next one is not worth its time
 _CLOSE = 0.06  # of log P above what the proposal says: another pass would not help
 
 
@@ -80,10 +82,10 @@ def _correct(plane: Plane, model: Model, plan: Plan, proposed: list[Proposed]) -
             due = sketch.needed(_TOP)
         else:
             payment, proof = proved_upper(surface, model, plane.starts)
-            if payment.log < min((one.log for _, one in proposed), default=0.0):
-                proposed.append((raised_above(surface), payment))
             start = extreme_over(surface, plane.starts, upper=True)
-            if payment.log < start + _CLOSE:
+            gained = min((one.log for _, one in proposed), default=math.inf) - payment.log
+            proposed += [(raised_above(surface), payment)] if gained > 0 and payment.log < 0 else []
+            if gained < _LITTLE or payment.log < start + _CLOSE:
                 return
             due = _due(proof, surface, start)
         more = Source.above(surface, _FACTOR * due)
