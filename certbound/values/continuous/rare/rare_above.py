@@ -10,6 +10,7 @@ the proof is `hypotheses.proved_upper`, which asks for V >= 0 on the faces and f
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -46,14 +47,15 @@ _FACTOR = 1.12
 _CAP = 50.0
 _GRANTED = 0.003  # eps that the proof may pay, in units of the bound, summed over the horizon
 _HOPELESS = 6.0  # what a corrected proposal may lose (log P)
+_FAR = 6.0  # of log P above a rough guess: another way may do better
 _LITTLE = 0.1  # of log P: where a pass gains less, the next one is not worth its time
 _CLOSE = 0.06  # of log P above what the proposal says: another pass would not help
 
 
 def bound_rare(plane: Plane, model: Model, seconds: float, level: float, wanted: float, other: Other) -> Found:
-    """An upper bound on one grid, by ``other`` (deadline, wanted) where there is none, or next to none.
+    """An upper bound on one grid, or by ``other`` (deadline, wanted) where that is far above the ``level``.
 
-    ``level`` is about log P. The seconds are turned into a number of patches, as in `two_states`.
+    That is about log P. The seconds are turned into a number of patches, as in `two_states`.
     """
     plan, proposed = plan_above(plane, level, _GRANT * RATE * max(1.0, seconds)), list[Proposed]()
     try:
@@ -61,10 +63,14 @@ def bound_rare(plane: Plane, model: Model, seconds: float, level: float, wanted:
     except OutOfTime:
         if not proposed:
             raise
-    if not proposed:
-        return other(time.perf_counter() + seconds, wanted)
-    upper = min(payment.log for _, payment in proposed)
-    return upper, None, f"value function in two states, cells: {plan.cells}^2", (proposed, [])
+    upper = min((payment.log for _, payment in proposed), default=0.0)
+    found: Found = upper, None, f"value function in two states, cells: {plan.cells}^2", (proposed, [])
+    if upper < level + _FAR:
+        return found
+    with contextlib.suppress(*([OutOfTime] if proposed else [])):
+        rest = other(time.perf_counter() + seconds, wanted)
+        found = rest if rest[0] <= upper else found
+    return found
 
 
 def _correct(plane: Plane, model: Model, plan: Plan, proposed: list[Proposed]) -> None:
