@@ -31,6 +31,7 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
+from certbound.values.continuous.rare import RAREST, bound_rare
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
@@ -84,17 +85,26 @@ def bound_plane(
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
     if wanted < math.inf:
         check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
-    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above, guesses=guesses)
+    granted, level = round(deadline - time.perf_counter(), 1), rough_level(inner)
+    if above and level < RAREST:
+        return bound_rare(inner, model, granted, level, wanted, other)
+    return bound_between(
+        problem, model, inner, outer, time.perf_counter() + granted, wanted, other, looked=above, guesses=guesses,
+        level=level,
+    )  # fmt: skip
 
 
 def bound_between(
     problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other,
-    *, looked: bool = True, guesses: list[float] | None = None,
+    *, looked: bool = True, guesses: list[float] | None = None, level: float | None = None,
 ) -> Found:
-    """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due."""
+    """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due.
+
+    ``level`` is about log P, if that is known.
+    """
     granted = round(deadline - time.perf_counter(), 1)
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
-    level = rough_level(inner)
+    level = rough_level(inner) if level is None else level
     if not served or not _RARE < level < 0:
         if served and _RAREST < level <= _RARE and granted >= _RARELY * _FINE**2:
             return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked, guesses)
