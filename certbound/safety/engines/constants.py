@@ -270,8 +270,9 @@ class _Work:
     @property
     def _narrower(self) -> str:
         """The beginning of a cure: cells where the initial set can be split."""
-        hull = self.problem.initial.hull()
-        return "split the initial set (cells), or try" if np.any(hull.lo < hull.hi) else "try"
+        start = self.problem.initial
+        wide = not start.random and np.any(start.hull().lo < start.hull().hi)
+        return "split the initial set (cells), or try" if wide else "try"
 
     def _when(self, time: float) -> str:
         return f"t = {time:.4g}" if self.flow.continuous else f"step {time:g}"
