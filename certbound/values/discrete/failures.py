@@ -139,17 +139,13 @@ def bound_failure(
         if not tried:
             shares = [other for other in shares_of(work.n, work.shocks, cubic=work.cubic) if other < share]
         tried.append((share, *found))
-        settled = spent > _PATIENCE and _settled(upper, lower, delta)
+        settled = delta is not None and spent > _PATIENCE and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
         if upper <= ratio * lower or settled or upper < (_UNIFORM_FLOOR if work.shocks.uniform else _FLOOR):
             break
     seconds = time.perf_counter() - begun
     return FailureBounds(
         upper=upper, lower=lower, cells=cells, share=tried[-1][0], seconds=seconds, tried=tuple(tried)
     )
-
-
-def _settled(upper: float, lower: float, delta: float | None) -> bool:  # with room to spare
-    return delta is not None and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
 
 
 class Work:
@@ -306,10 +302,11 @@ class Work:
         return above, below
 
     def _smooth_step(self, grids: list[Grid], zones: Zones) -> CubicTransition | None:
-        """The step of all grids, if they are one, all of it safe, and nothing but smooth dynamics matters."""
-        if not self._alike or len(grids) < 2 or len({id(grid) for grid in grids}) > 1 or not zones.safe.all():
-            return None
-        return cubic_transition(self.dynamics, 0, grids[0], self.shocks)
+        """The step of all grids, if they are one, all of it safe and smooth."""
+        fits = self._alike and len(grids) > 1 and len({id(grid) for grid in grids}) == 1 and bool(zones.safe.all())
+        found = cubic_transition(self.dynamics, 0, grids[0], self.shocks) if fits else None
+        self._alike = found is not None  # else not tried again
+        return found
 
     def _kept_transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         """The transition of a step, the same one as long as nothing changes."""

@@ -263,3 +263,19 @@ def test_tables_without_cubics_refuse_curved_functions() -> None:
     tables = Tables(value.grid, transition.tables.shocks, *transition.step.hull())
     with pytest.raises(KeyError):
         tables.field(value)
+
+
+def test_images_far_off_the_grid_are_left_to_constant_bends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def counted(*given: Any) -> CubicTransition | None:
+        asked.append(1)
+        return cubic_transition(*given)
+
+    monkeypatch.setattr("certbound.values.discrete.failures.cubic_transition", counted)
+    system = cb.DiscreteSystem(lambda x: 1 - 3 * x[0] ** 2, states=1, noise=cb.Gaussian(std=0.05))
+    problem = cb.Problem(system, initial=[0.4], safe=[cb.Inside(cb.Box([-1], [1.2]))], horizon=3)
+    found = bound_failure(problem, ratio=1.01)
+    assert 0 < found.lower <= found.upper < 1
+    assert len(found.tried) > 1
+    assert len(asked) == 1

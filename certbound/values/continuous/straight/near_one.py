@@ -54,7 +54,7 @@ _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0, 2.0)  # both where failing is rare
 _FIRST, _ABOVE, _BELOW = 0.5, 0.44, 0.56  # of what may be spent, for logarithms; of the rest, for each bound then
 _RARELY = 0.0035  # about the seconds of one of them, over cells^2
-_FAR = 1.0  # of log P above a rough guess: logarithms may do better
+_FAR, _FARTHER = 1.0, 3.0  # of log P above a rough guess: a finer grid does better, and logarithms may
 _FINE = 34  # cells along each state, without which nothing comes of it
 _LONG = {True: 0.02, False: 0.012}  # a ramp's share of the horizon then: fronts start as wide as cells
 _NEARLY = 0.1  # of log P: what is left to pay is no more
@@ -172,6 +172,8 @@ def _with_rare(
         words, granted, room = f"{words}, ", (1 - share) * granted, (1 - share) * room
     shares = (_ABOVE, _BELOW) if room * _ABOVE >= 1 else (1.0, 1.0)
     cells = [round(math.sqrt(share * granted / _RARELY)) for share in shares]
+    if looked and shares[0] == 1:  # with what logarithms would take
+        cells[0] = round(math.sqrt((1 + _FIRST) * granted / _RARELY))
     outer = outer if shares[0] < 1 or not looked else None  # one bound or none
     try:
         if looked:
@@ -182,7 +184,7 @@ def _with_rare(
         if upper > wanted and outer is not None and wanted < math.inf:
             least = rarely(outer, model, cells[1], level, points_of(problem), below=True)
             words += f", {cells[1]}^2 below"
-        done = not looked or upper <= wanted or upper < level + _FAR
+        done = not looked or upper <= wanted or upper < level + (_FARTHER if shares[0] == 1 else _FAR)
         if not done or (least is None and upper > wanted and outer is not None and wanted < math.inf):
             logs = other(time.perf_counter() + _FIRST * granted, wanted)
             least = max((one for one in (least, logs[1]) if one is not None), default=None)

@@ -33,6 +33,7 @@ from certbound.values.discrete.cubic.majorants import HIGHEST, Majorants, deriva
 from certbound.values.discrete.dominance import KAPPA, dominance
 from certbound.values.discrete.fields import Field, Tables
 from certbound.values.discrete.functions import ValueFunction
+from certbound.values.discrete.kernels import REACH
 from certbound.values.discrete.shocks import Shocks
 from certbound.values.discrete.steps import CellImages, Dynamics, Step
 from certbound.values.discrete.transitions import Forms, Places, Transition, rule_constants, sliding
@@ -57,10 +58,10 @@ def cubic_transition(dynamics: Dynamics, t: int, grid: Grid, shocks: Shocks) -> 
     if len(step.cells) > 1 or step.pieces.size or not step.cells[0].smooth.all() or min(grid.shape) < 2:
         return None
     low, high = step.hull()
-    tables = Tables(grid, shocks, low, high, cubic=True)
-    mesh = tables.mesh
-    if np.any(low < mesh.start) or np.any(high > mesh.start + mesh.step * (np.array(mesh.count) - 1)):
+    reach = REACH * (shocks.sigma.mid + np.abs(shocks.factor.mid)) * (1 - 1e-9)  # meshes end there
+    if any(a < axis[0] - r or b > axis[-1] + r for a, b, axis, r in zip(low, high, grid.axes, reach)):
         return None
+    tables = Tables(grid, shocks, low, high, cubic=True)
     sizes = majorants(dynamics, t, grid, tables)
     if sizes is None:
         return None
