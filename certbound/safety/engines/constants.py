@@ -30,6 +30,7 @@ from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
+from certbound.problem.sets import check_start
 from certbound.reach.contraction import (
     contraction_tube,
     local_constants,
@@ -82,6 +83,8 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     before the horizon.
     """
     problem = in_pieces(problem)
+    if problem.system.time == "discrete":
+        check_start(problem.initial, problem.safe, apart=True)
     method, constants, quick = asked.method, asked.constants, asked.quick
     if constants is not None:
         refuse_contradiction(problem, constants)
