@@ -81,6 +81,7 @@ def bound_near_walls_below(
             needed = np.maximum(needed - left, 0.0)
             beside = np.pad(needed, ((1, 1), (0, 0), (0, 0)))  # sources that change fast feed each other
             needed = np.maximum(needed, np.maximum(beside[:-2], beside[2:]))
+            needed[-1] = 0.0  # U is next to nothing yet
             more = Source.above(surface, factor * needed)
             source = more if source is None else source.plus(more)
     except (RuntimeError, ValueError):  # a singular system, or a proposal that is not finite
