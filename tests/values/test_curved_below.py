@@ -168,7 +168,7 @@ def disc_below() -> tuple[cb.Problem, object, Plane, Walls, Surface, float]:
 
 
 def bound_of(surface: Surface, negligible: float = 1e-9) -> float | None:
-    problem, model, plane, walls, _, small = disc_below()
+    _, model, plane, walls, _, small = disc_below()
     cuts, points = Cuts.of(surface.axes, walls), np.array([[0.0, 0.0]])
     surface = proof_below.sunk_within(surface, cuts, walls)
     seen = proof_below.seen_within(surface, cuts, model, points, negligible, plane.cut)
@@ -181,8 +181,8 @@ def test_a_proposal_in_a_disc_is_near_the_truth_and_wrong_ones_prove_no_more_tha
     surface, rng = disc_below()[4], np.random.default_rng(3)
     assert truth - 1.0 < (bound_of(surface) or -9.0) <= truth
     wrong = [surface.raised(by * small) for by in (-0.1, 0.1, 0.5)]
-    wrong += [replace(surface, **{name: factor * getattr(surface, name) for name in ("values", "start_rates", "end_rates")})
-              for factor in (0.3, 3.0)]  # fmt: skip
+    names = ("values", "start_rates", "end_rates")
+    wrong += [replace(surface, **{name: factor * getattr(surface, name) for name in names}) for factor in (0.3, 3.0)]
     wrong += [spoilt(surface, rng, size) for size in (1e-8, 1e-6)]
     shifted = surface.values.copy()
     shifted[:-1] += 0.4 * small * np.eye(3)[0][:, None, None] * np.eye(3)[0]  # only before the horizon
@@ -232,9 +232,15 @@ def test_both_sides_reach_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def setting(problem: cb.Problem) -> tuple[Plane, object]:
-    plane, walls, _ = plane_for(problem)
     region = region_of(problem, *floats_of(exits._model(problem)), near=False)
-    return plane, region
+    return plane_for(problem)[0], region
+
+
+def test_an_obstacle_beyond_the_box_has_no_walls_to_propose_at() -> None:
+    plane, _, _ = plane_for(with_limits(cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(cb.Ball([0.5, 0.5], 0.2))))
+    far = Walls.of([cb.Outside(cb.Ball([50.0, 0.0], 1.0))])
+    for below in (None, 0.1):
+        assert walled_ramps.WalledRamps(plane, far, 8, below=below).at_walls.shape[0] == 0
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ class WalledRamps(Ramps):
     def _at(self, points: Array) -> csr_matrix:
         """What leads from the coefficients to U at some points."""
         rows = [one.spline(points[:, axis]) for axis, one in enumerate(self.splines)]
-        return csr_matrix(np.einsum("pi,pj->pij", *rows).reshape(len(points), -1))
+        return csr_matrix(np.einsum("pi,pj->pij", *rows).reshape(len(points), len(self.count)))
 
     def top(self, whole: Surface) -> float:
         assert isinstance(self.walls, Walls)
