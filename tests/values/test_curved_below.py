@@ -81,7 +81,7 @@ def test_paths_may_end_at_the_horizon_and_at_faces_that_are_no_limits() -> None:
     data = surface.values.copy()
     data[1, :, 0, :, 0] -= 5.0
     falling = replace(surface, values=data)
-    assert proof_below.end_within(falling, cuts, none) <= -3.3  # 1.4 - 5, up to a cell
+    assert -3.6 <= proof_below.end_within(falling, cuts, none) <= -3.3  # at most 1.6 - 5, up to a cell
     assert proof_below.end_within(falling, cuts, ((False, True), (False, False))) <= -3.3  # beyond the limit
     top = proof_below.end_within(falling, cuts, ((False, False), (False, True)))
     assert 1.2 <= top <= 1.6  # at y = 1, up to x = .2
@@ -229,6 +229,8 @@ def test_both_sides_reach_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bound_exits(in_disc(0.5, 0.7), seconds=10.0, lower=False).lower is None
     assert bound_exits(in_disc(0.5, 0.7), seconds=10.0, delta=0.9).lower is None
     assert bound_exits(in_disc(0.5, 0.7), seconds=5.0).lower is None
+    assert bound_exits(in_disc(0.5, 0.7), seconds=5.0, delta=0.55).lower is None  # about .5 fail
+    assert bound_exits(in_disc(0.5, 0.7), seconds=5.0, delta=0.3).lower is not None
 
 
 def setting(problem: cb.Problem) -> tuple[Plane, object]:

@@ -60,7 +60,8 @@ _STEEP = 1.0  # how far V falls at most over a cell at a wall, at the horizon
 _SAMPLES = (4, 5, 5)
 _SELDOM = math.log(1e-7)  # log P below which U itself is not proposed
 _LEAST, _COST, _MOST = 2.5, 0.0075, 60  # seconds that it takes, about those of a proposal over cells^2, most cells
-_BELOW, _LEAST_BELOW = 0.8, 8.0  # of as many seconds again, for the lower bound; with fewer cells there is none
+_BELOW, _LEAST_BELOW = 0.8, 8.0  # of as many seconds again, for the lower bound; with fewer it has to decide
+_FEWEST_BELOW = 40  # cells without which there hardly is one
 _NEARLY = 0.3  # of log P above a rough guess: then log U is proposed, too
 _RANK = 1e-9  # of the squared noise: a smaller share in some direction everywhere is none
 Squares = Callable[[float, Array, Array], Array]
@@ -99,10 +100,11 @@ def bound_region(problem: Problem, model: Model, deadline: float, wanted: float,
             raise
         done.append(f"{plan.cells}^2")
     lower = None
-    if upper > wanted and wanted < math.inf and served and granted >= _LEAST_BELOW:
+    due = granted >= _LEAST_BELOW or -math.inf < wanted < level
+    if upper > wanted and wanted < math.inf and served and due:
         from certbound.values.continuous.curved.near_walls_below import bound_near_walls_below
 
-        cells = min(math.isqrt(int(_BELOW * granted / _COST)), _MOST)
+        cells = min(max(math.isqrt(int(_BELOW * granted / _COST)), _FEWEST_BELOW), _MOST)
         with contextlib.suppress(OutOfTime, InfeasibleError):  # noise that may vanish somewhere
             lower = bound_near_walls_below(problem, plane, region.walls, model, cells, math.exp(level))
         done.append(f"{cells}^2 below")

@@ -98,15 +98,15 @@ def ended_at_limits(problem: Problem, plane: Plane, walls: Walls, cells: int) ->
     Cut is a side, too, from which the drift leads back faster than cells can follow: U = 0 there costs little.
     """
     inner, outer = limits_around(problem)
-    ends, cut = [list(plane.low), list(plane.high)], [[False, False], [False, False]]
-    for axis, side in itertools.product((0, 1), (0, 1)):
-        limit = ends[side][axis] == inner[side][axis]
-        if limit:
-            ends[side][axis] = float(outer[side][axis])
-        cut[axis][side] = not (limit and _follows(plane, axis, side, cells)) and _meets(plane, walls, axis, side)
-    low, high = ((row[0], row[1]) for row in ends)
-    sides = [(row[0], row[1]) for row in cut]
-    return replace(plane, low=low, high=high, cut=(sides[0], sides[1]))
+    ends, sides = [list(plane.low), list(plane.high)], list(itertools.product((0, 1), (0, 1)))
+    limits = {(axis, side): ends[side][axis] == inner[side][axis] for axis, side in sides}
+    for axis, side in sides:
+        ends[side][axis] = float(outer[side][axis]) if limits[axis, side] else ends[side][axis]
+    wide = replace(plane, low=(ends[0][0], ends[0][1]), high=(ends[1][0], ends[1][1]))
+    cut = {
+        one: not (limits[one] and _follows(wide, *one, cells)) and _meets(wide, walls, *one) for one in sides
+    }  # fmt: skip
+    return replace(wide, cut=((cut[0, 0], cut[0, 1]), (cut[1, 0], cut[1, 1])))
 
 
 def _follows(plane: Plane, axis: int, side: int, cells: int) -> bool:
