@@ -118,6 +118,20 @@ def test_the_residual_is_enclosed_from_below_where_v_may_be_negative(name: str) 
     assert count > 20
 
 
+def test_the_inequality_is_asked_wherever_v_is_not_above_0() -> None:
+    flat = sloping(AXES, (0.0, 0.0))
+    values = np.repeat(flat.values[:1], 3, axis=0)
+    values[:, :, 0, :, 0] += np.array([-1e-8, -1e-7, -1.0])[:, None, None]
+    none = np.zeros((2, *values.shape[1:]))
+    falling = Surface(axes=AXES, times=np.array([0.0, 0.5, 1.0]), values=values, start_rates=none, end_rates=none)
+    walls = Walls.of([cb.Outside(cb.Ball([0.5, 0.5], 0.2))])
+    model = read(lambda t, x: [-x[0], -x[1]], 0.4 * np.eye(2), ["x1", "x2"])
+    cuts, points = Cuts.of(AXES, walls), np.array([[0.0, 0.0]])
+    seen = proof_below.seen_within(falling, cuts, model, points, 1e-12, ((False, False),) * 2)
+    assert set(seen.slab) == {0, 1}
+    assert seen.ranges.residual_low[seen.slab == 0].max() < 0
+
+
 def plane_for(problem: cb.Problem) -> tuple[Plane, Walls, object]:
     model = exits._model(problem)
     region = region_of(problem, *floats_of(model), near=False)
@@ -246,11 +260,7 @@ def test_an_obstacle_beyond_the_box_has_no_walls_to_propose_at() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("problem", "truth", "ratio"), [
-    (lambda: in_disc(1.0, 0.5), leaving_a_disc(1.0, 0.5), 1.5),
-    (lambda: in_disc(0.5, 0.7), leaving_a_disc(0.5, 0.7), 1.5),
-])  # fmt: skip
-def test_a_disc_is_left_as_seldom_as_bessels_series_says(problem, truth: float, ratio: float) -> None:
-    found = bound_exits(problem(), seconds=20.0)
+def test_a_disc_is_left_at_least_as_often_as_bounded() -> None:
+    found, truth = bound_exits(in_disc(), seconds=20.0), leaving_a_disc()
     assert found.lower is not None
-    assert truth / ratio <= 10**found.lower <= truth <= 10**found.upper
+    assert truth / 1.6 <= 10**found.lower <= truth <= 10**found.upper
