@@ -34,6 +34,8 @@ def _floats(name: str, value: Any) -> Array:
     try:
         raw = np.asarray(value)
         array = np.asarray(raw, dtype=float) if raw.dtype.kind in "biufO" else None
+    except OverflowError as error:
+        raise ValueError(f"`{name}` must hold numbers of at most 1.8e308 in size.") from error
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must hold numbers, got {value!r}.") from error
     if array is None or value is None:
@@ -131,7 +133,15 @@ def names(name: str, value: Sequence[str], reserved: Iterable[str] = ()) -> tupl
     return result
 
 
-_OTHER_NAMES = {"normal": "gaussian", "double_exponential": "laplace", "empirical": "histogram"}
+_OTHER_NAMES = {
+    "normal": "gaussian", "double_exponential": "laplace", "empirical": "histogram", "constants": "parameters",
+    "params": "parameters", "variables": "states", "state": "states", "system": "dynamics", "drift": "dynamics",
+    "equations": "dynamics", "initial_state": "initial", "x0": "initial", "start": "initial", "safe": "stay",
+    "constraints": "stay", "unsafe": "avoid", "obstacle": "avoid", "obstacles": "avoid", "target": "reach",
+    "goal": "reach", "T": "horizon", "steps": "horizon", "offset": "bound", "interval": "box", "disturbance":
+    "disturbances", "input": "inputs", "functions": "definitions", "where": "definitions", "window": "during",
+}  # fmt: skip
+"""Words that other tools use, and people, for what is known here by another."""
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -10,6 +10,8 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, ParamSpec, TypeVar
 
+from certbound.watch import undisturbed
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -65,7 +67,7 @@ class compiled(Generic[P, R]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         if self.kernel is not None:
             return self.kernel(*args, **kwargs)
-        with uncollected():
+        with undisturbed(), uncollected():  # numba's registries do not survive an exception while they are filled
             return self._ready()(*args, **kwargs)
 
     def _ready(self) -> Callable[P, R]:

@@ -23,6 +23,7 @@ _OFTEN = 0.25  # seconds between two reports that say nothing new
 _GRACE = 0.05  # of the limit, and seconds, after which a timer ends what does not poll
 _AGAIN = 1.0  # seconds after which it does so again, should its exception have been lost
 _SOON = 0.05  # the same where a module was being loaded
+_HELD: list[bool] = []  # for every block of the main thread that must not be interrupted
 
 
 class OutOfTime(BaseException):
@@ -78,7 +79,7 @@ class Watch:
         self, limit: float | None = None, *, progress: Callable[[Progress], object] | None = None,
         clock: Callable[[], float] = time.perf_counter, jobs: int = 1, executor: Any = None, patient: bool = False,
     ) -> None:
-        if limit is not None and not (isinstance(limit, (int, float)) and limit > 0):
+        if limit is not None and not (isinstance(limit, (int, float)) and 0 < limit < math.inf):
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
         if isinstance(jobs, bool) or int(jobs) != jobs or jobs < 1:
             raise ValueError(f"`jobs` must be a positive number of processes, got {jobs!r}.")
@@ -171,7 +172,7 @@ class Watch:
         loading = _loading(sys._getframe())
 
         def stop(number: int, frame: FrameType | None) -> None:
-            if _loading(frame) > loading:  # a library that is loaded by half is broken for good
+            if _HELD or _loading(frame) > loading:  # a library that is loaded by half is broken for good
                 signal.setitimer(signal.ITIMER_REAL, _SOON, _AGAIN)
                 return
             raise OutOfTime
@@ -289,14 +290,22 @@ def executor_lent() -> Any:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Hold the timer of a limit back in the block, for a library that an interruption would leave broken for good."""
+    """Hold the timer of a limit back in the block, for a library that an interruption would leave broken for good.
+
+    A signal that another thread takes is handled in the main one all the same: so it is told as well as masked.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    main = threading.current_thread() is threading.main_thread()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+    if main:
+        _HELD.append(True)
     try:
         yield
     finally:
+        if main:
+            del _HELD[-1:]  # none in a copy of the process
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
@@ -304,6 +313,7 @@ def silenced() -> None:
     """Let the watch that runs, if any, only end the work: in a copy of the process, whose own timers are heard."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})
+    _HELD.clear()
     watch = _CURRENT.get()
     if watch is not None:
         watch.silence()

@@ -19,7 +19,8 @@ PACKAGE = ROOT / "certbound"
 
 # What a line names may import the lines above it: rooms, sub-rooms, and single modules that stand between these.
 ORDER = """
-errors lazy arrays watch _version
+errors watch
+lazy arrays _version
 parallel
 checks
 display

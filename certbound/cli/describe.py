@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from certbound.display import rounded
 
 if TYPE_CHECKING:
     from certbound.safety.verification import Verdict
@@ -40,3 +44,12 @@ def describe_deviation(verdict: Verdict) -> dict[str, Any] | None:
     where no tube could be certified.
     """
     return None if verdict.deviation is None else attributes(verdict.deviation, "times", "radius", "extent")
+
+
+def deviation_text(tube: Mapping[str, Any], names: Sequence[str]) -> str:
+    """The largest deviation of a tube: its norm, or by state where it bounds some of the states alone."""
+    if math.isfinite(radius := max(tube["radius"])):
+        return f"at most {rounded(float(radius), up=True, digits=4)}"
+    largest = zip(names, map(max, zip(*tube["extent"])))
+    bounded = [f"{rounded(float(size), up=True, digits=4)} in {name}" for name, size in largest if math.isfinite(size)]
+    return f"at most {', '.join(bounded)}" if bounded else "not bounded"

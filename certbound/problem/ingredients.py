@@ -16,6 +16,7 @@ from certbound.problem.sets import Box, GaussianStart, Region, StartUnion
 from certbound.problem.systems import System
 
 _LONGEST_UNIT = 20
+_SHORTEST, _LONGEST = 1e-50, 1e50  # horizons in continuous time: their fifth powers are floats
 _MOST_SAMPLES = 1000
 
 
@@ -28,6 +29,11 @@ def checked_horizon(value: Any, discrete: bool) -> float | int:
         if horizon != int(horizon):
             raise ValueError(f"`horizon` must be a whole number of steps in discrete time, got {horizon:g}.")
         return int(horizon)
+    if np.isfinite(horizon) and not _SHORTEST <= horizon <= _LONGEST:
+        raise ValueError(
+            f"`horizon` must lie between {_SHORTEST:g} and {_LONGEST:g}, or be infinite, got {horizon:g}; choose "
+            "another unit of time."
+        )
     return horizon
 
 

@@ -8,7 +8,7 @@ react to the past and the state; it never sees coming noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,7 +29,8 @@ from certbound.problem.signals import diffusion_of, signal_box, signal_names, st
 class System:
     """What continuous and discrete time share: names of the signals, and where u and d live.
 
-    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,).
+    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,). ``turn`` is T where the
+    system is that of y = T x and ``states`` name x: what is said of limits is said of x then (`said_of`).
     """
 
     states: tuple[str, ...]
@@ -38,8 +39,13 @@ class System:
     disturbance: Box | None
     disturbance_names: tuple[str, ...]
     dynamics: Tape
+    turn: Array | None = field(default=None, init=False)
 
     time: ClassVar[str]
+
+    def said_of(self, row: Array) -> Array:
+        """A linear function of the system's own coordinates, shape (n,), as one of the states that have names."""
+        return row if self.turn is None else np.asarray(row @ self.turn)
 
     @property
     def dimension(self) -> int:

@@ -19,8 +19,8 @@ from certbound.constants.enclosures import enclose
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, is_zero, jacobian
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Faces, Inside, Quadratic
-from certbound.problem.systems import ContinuousSystem
+from certbound.problem.sets import Faces, HalfSpace, Inside, Quadratic
+from certbound.problem.systems import ContinuousSystem, System
 from certbound.quadratic.form_matrices import as_forms, ball_form, linear_form, scaled_row
 from certbound.rigor.intervals import Interval, concatenate
 
@@ -71,6 +71,7 @@ class Start:
 class Setting:
     """The working box, what else bounds the paths, and where they start."""
 
+    system: System
     center: Array
     width: Array
     walls: tuple[Wall, ...]
@@ -87,8 +88,11 @@ class Setting:
         if wall.side is None:
             return wall.label
         axis, upper = wall.side
-        limit = self.center[axis] + (self.width[axis] if upper else -self.width[axis])
-        words = f"{wall.label.rsplit(' ', 1)[0]} {'<=' if upper else '>='} {limit:.4g}"
+        row = self.system.said_of(np.eye(self.dimension)[axis])
+        unit = float(np.abs(row).max())
+        limit = (self.center[axis] + (self.width[axis] if upper else -self.width[axis])) / unit
+        name = HalfSpace(row / unit, 0.0).describe(self.system.states, "inside").partition(" <= ")[0]
+        words = f"{name} {'<=' if upper else '>='} {limit:.4g}"
         return f"{words}, a side of a box that certbound chose" if wall.own else words
 
     def over(self, low: Array, high: Array) -> Interval:
@@ -162,8 +166,8 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
             wall = _flat(problem, center, width, Interval.point(row), label)
             gap = (high[axis] - safe[1][axis]) if sign > 0 else (safe[0][axis] - low[axis])
             walls.append(None if wall is None else replace(wall, own=bool(gap < -1e-9 * width[axis])))
-    return Setting(center=center, width=width, walls=tuple(w for w in walls if w is not None), inside=known,
-                   start=start)  # fmt: skip
+    found = tuple(wall for wall in walls if wall is not None)
+    return Setting(system=problem.system, center=center, width=width, walls=found, inside=known, start=start)
 
 
 def _side(n: int, axis: int, sign: float) -> Interval:

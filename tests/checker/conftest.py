@@ -18,6 +18,7 @@ from flint import arb, ctx
 
 import certbound as cb
 from certbound.checker import parse
+from certbound.checker.linear import events
 from certbound.checker.values import step_back
 from certbound.quadratic import bound_quadratic
 from certbound.quadratic.refinement import Search
@@ -242,19 +243,27 @@ def precise() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def kept_tables() -> Iterator[None]:
-    """Integrals of the noise that many changed copies of one certificate have in common are computed once."""
+    """Integrals that many changed copies of one certificate have in common are computed once, by all their digits."""
     tables: dict[Any, Any] = {}
-    compute = step_back.axis_table
+    compute, meet = step_back.axis_table, events.below_and_above
+
+    def exactly(ball: arb) -> Any:
+        return (ball.mid().man_exp(), ball.rad().man_exp()) if ball.is_finite() else str(ball)
 
     def kept(points: Any, edges: Any, deviation: arb, degree: int, budget: Any) -> Any:
         budget.check()
-        ball = deviation.mid().man_exp(), deviation.rad().man_exp(), ctx.prec
-        key = points.tobytes(), np.asarray(edges).tobytes(), ball, degree
+        key = points.tobytes(), np.asarray(edges).tobytes(), exactly(deviation), ctx.prec, degree
         if key not in tables:
             tables[key] = compute(points, edges, deviation, degree, budget)
         return tables[key]
 
-    with patch.object(step_back, "axis_table", kept):
+    def met(*numbers: arb) -> arb:
+        key = *map(exactly, numbers), ctx.prec
+        if key not in tables:
+            tables[key] = meet(*numbers)
+        return tables[key]
+
+    with patch.object(step_back, "axis_table", kept), patch.object(events, "below_and_above", met):
         yield
 
 

@@ -7,10 +7,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import certbound as cb
 from certbound.cli.app import app, run
+from certbound.cli.describe import deviation_text
 from certbound.cli.output import write_file
 
 VERIFY_KEYS = {
@@ -146,6 +148,13 @@ def test_people_get_the_verdict_first(capsys: pytest.CaptureFixture[str]) -> Non
     assert lines[0].startswith("SAFE  ou: P(leaving within 5 s) <= ")
     assert lines[0].endswith("asked 0.001")
     assert lines[1].startswith("margin ")
+
+
+def test_a_deviation_that_is_bounded_in_some_states_is_said_of_these() -> None:
+    """It said `at most inf`."""
+    tube = {"radius": [0.5, np.inf], "extent": [[0.3, 0.4, 0.1], [0.2, np.inf, 0.15]]}
+    assert deviation_text(tube, ["x", "y", "z"]) == "at most 0.3 in x, 0.15 in z"
+    assert deviation_text({**tube, "radius": [0.5, 0.25]}, ["x", "y", "z"]) == "at most 0.5"
 
 
 # ---- derive, tune, problems, new -----------------------------------------------------------------------------

@@ -284,3 +284,15 @@ def test_constants_that_were_altered_after_their_proof_are_no_longer_certified(c
     assert proved.certified
     altered = {name: getattr(proved, name) * factor for name, factor in change.items()}
     assert replace(proved, **altered).certified == (change == {"sigma": 1.0})
+
+
+def test_samples_whose_measure_would_overflow_are_left_out() -> None:
+    """A stirred reactor: slopes were finite, their symmetric part was not, and the search ended with LAPACK's error."""
+
+    def flow(x: object) -> list[object]:
+        reaction = 0.072 * (1 - x[0]) * np.exp(x[1] / (1 + x[1] / 20))  # type: ignore[index]
+        return [-x[0] + reaction, -3.3 * x[1] + 8 * reaction - x[2], 0.5 * (x[1] - 2.5)]  # type: ignore[index]
+
+    system = cb.ContinuousSystem(flow, states=3, diffusion=0.01 * np.eye(3))
+    with pytest.raises(InfeasibleError):
+        bound_constants(system)

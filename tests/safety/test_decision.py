@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -21,7 +22,7 @@ from certbound.safety.engines import linear_chance
 from certbound.safety.limits import Limits
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verdict import Verdict
-from certbound.watch import OutOfTime, Progress, Watch, poll, seconds_left
+from certbound.watch import OutOfTime, Progress, Watch, poll, seconds_left, undisturbed
 
 Steps = list[tuple[float, float]]
 """Seconds that an engine works, and the log10 that it has proved then."""
@@ -314,7 +315,7 @@ def test_a_share_of_time_ends_quietly_and_the_whole_does_not(clock: Time) -> Non
     assert seconds_left() == float("inf")
 
 
-@pytest.mark.parametrize("limit", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("limit", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_limit_must_be_positive(limit: float) -> None:
     with pytest.raises(ValueError, match="`time_limit` must be a positive number of seconds"):
         cb.verify_safety(problem(), time_limit=limit)
@@ -360,6 +361,24 @@ def test_a_timer_that_goes_off_in_a_callback_of_compiled_code_goes_off_again_wit
     with pytest.raises(OutOfTime), Watch(0.01).running():
         time.sleep(5 if lose() is None else 0)
     assert sys.unraisablehook is before
+
+
+def test_a_timer_that_another_thread_hears_waits_until_what_must_not_be_interrupted_is_over() -> None:
+    """A mask is of one thread; the handler runs in the main one all the same, and left numba's registries broken."""
+    begun, done = threading.Event(), []
+    other = threading.Thread(target=lambda: begun.wait() and signal.raise_signal(signal.SIGALRM))
+    other.start()
+
+    def work() -> None:
+        with undisturbed():
+            begun.set()
+            other.join()
+            done.append("whole")
+        time.sleep(5)
+
+    with pytest.raises(OutOfTime), Watch(20.0).running():
+        work()
+    assert done == ["whole"]
 
 
 def test_an_upper_bound_near_the_truth_that_is_too_large_is_answered_from_below() -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 import certbound as cb
 from certbound.checker import check_data, parse
-from certbound.errors import CertificateError
+from certbound.cli.commands.check import proved_certificate
+from certbound.errors import EngineError
 from certbound.safety.answers import EngineAnswer
-from certbound.safety.certificate import certificate_data, problem_data
+from certbound.safety.certificate import problem_data
 from certbound.safety.portfolio import ENGINES, engine_named, in_order
 from certbound.safety.verdict import best_lower
 from certbound.safety.verification import verify_safety
@@ -23,6 +22,16 @@ LOOSER = {
     ("barrier", "spring"): "the search for a polynomial stops at a tolerance",
 }
 """Where less noise or time gives a larger bound, which is sound and costs tightness, and why."""
+ENOUGH = ("quadratic",)
+"""Engines that end at the first bound below delta: less noise is SAFE too, with another one of the bounds below it."""
+UNWRITTEN = {
+    "linear": ["double_well"],  # the writer's own events are coarser than the engine's
+    "constants": ["double_well", "prices", "spring"],  # constants along a tube
+    "barrier": ["random_start"],
+    "quadratic": ["walk", "decay", "sine", "uniform", "coins", "pushed", "spiral", "swing", "post", "random_start"],
+    "values": ["window", "pendulum", "circle", "spring"],
+}
+"""Bounds that no certificate states."""
 ROWS = [(engine, name) for engine in ENGINES for name in ZOO]
 
 
@@ -52,20 +61,18 @@ def test_a_bound_holds_and_is_certified_and_grows_with_what_it_must(engine: str,
     for factor in ((0.8, 1.0), (1.0, 0.5)):  # less noise, a shorter horizon
         less = verify_safety(ZOO[name](*factor), method=engine)
         assert (less.status == "SAFE") >= (verdict.status == "SAFE")
-        if (engine, name) not in LOOSER:
+        if (engine, name) not in LOOSER and (engine not in ENOUGH or less.status != "SAFE"):
             assert less.log10_delta <= verdict.log10_delta * (1 - 0.02) + 0.02
     looser = verify_safety(problem.replace(delta=0.1), method=engine)
     assert (looser.status == "SAFE") >= (verdict.status == "SAFE")
     if ENGINES[engine].write is None or verdict.log10_delta >= 0:
         return
     try:
-        data = certificate_data(problem, verdict)
-    except CertificateError:
+        data = parse(proved_certificate(problem, verdict, []))
+    except EngineError:
+        assert name in UNWRITTEN[engine]
         return
-    if float.fromhex(data["claim"]["log10_delta"]) == 0.0:
-        return  # nothing is claimed: the writer's own events are coarser than the engine's
-    report = check_data(parse(json.dumps(data)), problem_data(problem))
-    assert report.valid, report.reason
+    assert check_data(data, problem_data(problem)).valid
 
 
 @pytest.mark.parametrize("name", ["logistic", pytest.param("relaxation", marks=pytest.mark.slow)])

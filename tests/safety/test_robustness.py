@@ -176,6 +176,7 @@ def test_warnings_and_interruptions_are_not_swallowed(kind: type[BaseException])
     ("options", "message"),
     [
         ({"cells": 0}, "`cells` must be a positive integer"),
+        ({"cells": float("nan")}, "`cells` must be a positive integer"),
         ({"method": "magic"}, "`method` must be one of"),
         ({"method": "thm3"}, "`method` 'thm3' needs constants with `rate`"),
         ({"constants": cb.Constants(rate=-1.0, sigma=0.1, dimension=1)}, "`constants` must state a gain"),

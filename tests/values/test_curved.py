@@ -208,7 +208,7 @@ def test_a_disc_is_left_as_often_as_bessels_series_says() -> None:
     truth = leaving_a_disc()
     found = bound_exits(in_disc(), seconds=10.0)
     assert truth <= 10**found.upper <= 1.5 * truth
-    assert found.lower is None
+    assert found.lower is None or 10**found.lower <= truth
     assert "curved limits" in found.words
 
 

@@ -8,7 +8,6 @@ import math
 import types
 
 import numpy as np
-import pytest
 
 import certbound as cb
 from certbound.values.continuous import exits
@@ -110,13 +109,3 @@ def test_what_promises_nothing_beside_another_way_is_not_asked_on_the_next_grid(
     alone = ["vain"]
     assert two_sides._promising(plane, model, plan, kinds=alone) is None
     assert alone == ["vain"]
-
-
-@pytest.mark.slow
-def test_the_reversed_van_der_pol_oscillator_where_leaving_has_a_probability_of_1e_17() -> None:
-    """The truth is 1.573e-17: differences of order 4 of log u on 360^2 and 480^2 cells."""
-    system = cb.ContinuousSystem(lambda x: [-x[1], x[0] + (x[0] ** 2 - 1) * x[1]], states=2, diffusion=0.1 * np.eye(2))
-    safe = [cb.Inside(cb.Box([-1.2, -1.2], [1.2, 1.2]))]
-    problem = cb.Problem(system, initial=cb.Box([-0.2, -0.2], [0.2, 0.2]), safe=safe, horizon=5)
-    found = exits.bound_exits(problem, seconds=20, delta=1.6e-17)
-    assert 1.57e-17 < 10**found.upper < 1.6e-16

@@ -283,3 +283,27 @@ def test_what_is_proved_where_failing_is_rare_stays_as_time_ends_and_grids_keep_
     found.clear()
     with pytest.raises(OutOfTime):
         ask(None)
+
+
+def test_where_time_is_short_logarithms_are_asked_only_where_a_grid_of_rare_failing_says_little(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cells, asked, found = list[int](), list[float](), [-7.1]
+    inner, model = plane(free())
+
+    def bounded(plane: Plane, model: Model, count: int, level: float, points: object, *, below: bool) -> float:
+        cells.append(count)
+        return found[0]
+
+    def other(deadline: float, wanted: float) -> tuple[object, ...]:
+        asked.append(wanted)
+        return -8.0, None, "cells: 16^2", ([], [])
+
+    def ask() -> float:
+        return near_one._with_rare(free(), model, (inner, inner), 5.0, -9.1, -10.0, other, True, None)[0]
+
+    monkeypatch.setattr(near_one, "rarely", bounded)
+    assert (ask(), asked) == (-7.1, [])
+    assert near_one._RARELY * cells[0] ** 2 == pytest.approx((1 + near_one._FIRST) * 5.0, rel=0.03)
+    found[0] = -5.0
+    assert (ask(), len(asked)) == (-8.0, 1)

@@ -224,10 +224,12 @@ def test_the_model_in_a_moving_frame_is_that_of_the_moved_state():
 
 def test_what_is_not_served_is_refused_in_words():
     moved = cb.Inside(cb.Box([-1, -1], [1, 1], center=lambda t: [0.1 * t, 0.0]))
+    jumping = cb.Inside(cb.Box([-1, -1], [1, 1], center=lambda t: [0.5 * np.floor(2 * t), 0.0]))
     late = cb.Inside(cb.Box([-0.7, -0.7], [0.7, 0.7]), during=(0.5, 1.0))
     ball = cb.Inside(cb.Ball([0, 0], 0.9), during=(0.5, 1.0))
     for changes, message in (
         ({"safe": [moved, late]}, "not both"),
+        ({"safe": [jumping]}, "without jumps"),
         ({"safe": [moved, cb.Inside(cb.Ball([0, 0], 0.9))]}, "moving boxes only"),
         ({"safe": [SQUARE, ball]}, "fixed boxes only"),
         ({"safe": [SQUARE, late], "initial": cb.GaussianStart([0.0, 0.0], 0.01 * np.eye(2))}, "random start"),

@@ -9,9 +9,9 @@ import pytest
 
 import certbound as cb
 from certbound.checker import check_data
-from certbound.cli.commands.check import proved_certificate
 from certbound.problem.files.loading import loads
 from certbound.rigor.intervals import Interval
+from certbound.safety.certificate import certificate_text
 from certbound.values.sets import active_at, box_around, contains, respected
 
 REGIONS = [
@@ -100,7 +100,7 @@ def test_a_level_that_is_to_be_avoided_is_a_limit() -> None:
     problem = loads(LEVEL)
     verdict = cb.verify_safety(problem, method="values", time_limit=60)
     assert verdict.status == "SAFE"
-    data = json.loads(proved_certificate(problem, verdict))
+    data = json.loads(certificate_text(problem, verdict))
     report = check_data(data)
     assert report.valid
     avoided = [one for one in data["problem"]["constraints"] if one["kind"] == "outside"]

@@ -17,7 +17,7 @@ import typer
 
 from certbound.cli.clock import Clock, VerdictLimitOption
 from certbound.cli.commands.check import proved_certificate
-from certbound.cli.describe import attributes, describe_constants, describe_deviation
+from certbound.cli.describe import attributes, describe_constants, describe_deviation, deviation_text
 from certbound.cli.messages import for_files
 from certbound.cli.options import (
     ClusterOption,
@@ -284,9 +284,8 @@ def _print(problem: Problem, result: dict[str, Any], caution: str) -> None:
             screen.print(line, markup=False)
     tube = result["tube"]
     if tube is not None:
-        largest = rounded(float(max(tube["radius"])), up=True, digits=4)
         but = f"but for a probability of {result['delta']!r}"
-        screen.print(f"stochastic deviation: at most {largest}, {but}", markup=False)
+        screen.print(f"stochastic deviation: {deviation_text(tube, problem.system.states)}, {but}", markup=False)
     screen.print(f"method {result['method']}, {result['seconds']:.1f} s", markup=False)
     for row in result.get("engines", ()):
         bound = f"<= {log10_text(row['log10_delta'])}" if row["applicable"] else "does not apply"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.problem.sets.constraints import GaussianStart, Inside
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
@@ -16,8 +17,13 @@ _ROUNDING, _SLACK = 1e-12, 1e-9
 """Shares of a state's size by which the start's centre, and its farthest part, may miss a constraint."""
 
 
-def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside]) -> None:
-    """Refuse a start that violates a constraint that is due at time 0, with a ValueError that names it."""
+def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside], *, apart: bool = False) -> None:
+    """Refuse a start that violates a constraint that is due at time 0, with a ValueError that names it.
+
+    ``apart``: with an InfeasibleError also one that may touch an obstacle then.
+    """
+    if apart:
+        _refuse_touching(initial, constraints)
     center = initial.middle
     for constraint in constraints:
         if constraint.during is not None and constraint.during[0] > 0:
@@ -35,6 +41,20 @@ def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside]) 
                 f"`initial` must satisfy every constraint that is due at time 0, but {fault} violates "
                 f"'{constraint.label}'; move the start or change the constraint."
             )
+
+
+def _refuse_touching(initial: Region | GaussianStart, constraints: Sequence[Inside]) -> None:
+    """InfeasibleError where a start may touch an obstacle that is due at time 0: it has failed there.
+
+    For bounds in discrete time that look at the steps from the first one on.
+    """
+    for constraint in constraints:
+        region, due = constraint.region, constraint.during is None or constraint.during[0] <= 0
+        if not (constraint.outside and due) or initial.random:
+            continue
+        near = _touches(initial, region, -_ROUNDING * _size(initial, region))
+        if near or bool(region.contains(initial.middle)):
+            raise InfeasibleError(f"a start touches the edge of '{constraint.label}', where it has failed.")
 
 
 def check_target(target: Region, constraints: Sequence[Inside], dimension: int) -> None:

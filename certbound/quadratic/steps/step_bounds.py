@@ -17,6 +17,7 @@ from certbound.arrays import Array, Integers
 from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
+from certbound.problem.sets import check_start
 from certbound.problem.systems import DiscreteSystem
 from certbound.quadratic.setting import Setting, Wall, make_setting, refuse, safe_sides
 from certbound.quadratic.steps.secants import secants
@@ -101,6 +102,7 @@ def bound_steps(
     if not problem.horizon <= _WINDOWS[-1] * _MOST_WINDOWS:
         raise InfeasibleError(f"these quadratic value bounds serve at most {_WINDOWS[-1] * _MOST_WINDOWS} steps.")
     refuse(problem)
+    check_start(problem.initial, problem.safe, apart=True)
     until, best = time.perf_counter() + seconds, StepsBound()
     for setting in _settings(problem):
         given = _steps(problem, setting)

@@ -12,6 +12,7 @@ from certbound.reach.linear.linearisation import Linearisation
 
 _POINTS = 64
 _MOST = 8  # active coordinates
+_MOST_KINKS = 16  # each of which takes its share of what is left out
 _FARTHEST = 2.0  # times the spread, for points at which kinks are looked for
 
 
@@ -31,13 +32,15 @@ def _curved(engine: Linearisation) -> Array:
     """Extreme eigen-directions of the Hessians in the metric of the deviation's spread."""
     active, cells, blocks = engine.model.active, engine.cells, engine.model.blocks
     count = len(active)
-    nothing = np.zeros((cells, engine.pieces, 0, count))
+    if not blocks:
+        return np.zeros((cells, engine.pieces, 0, count))
+    rows = _normals(engine)
     if not 2 <= count <= _MOST or len(blocks) != 1 or len(blocks[0]) != 1:
-        return nothing
+        return rows
     hessians = engine.model.reference_hessians(engine.frame).reshape(cells, engine.pieces, -1, count, count)
     kinks = not hessians.any() and engine.model.kinked and not engine.model.planar
     if not hessians.shape[2] and not kinks:
-        return nothing
+        return rows
     node = slice(1, None) if engine.continuous else slice(0, -1)
     spread = 16 * engine.response.covariance[:, node] + _spread(engine)[:, node]
     spread = spread[..., active, :][..., active]
@@ -45,11 +48,11 @@ def _curved(engine: Linearisation) -> Array:
     spread = spread + (1e-9 * trace + 1e-30 * float(engine.sizes.max()) ** 2 + 1e-300) * np.eye(count)
     root = np.linalg.cholesky(spread)
     inverse = np.linalg.inv(root)
-    if kinks:
-        hessians = _jumps(engine, root)
-    _, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2)[:, :, None] @ hessians @ root[:, :, None])
-    chosen = np.swapaxes(vectors, -1, -2)[..., [-1] if kinks else [0, -1], :] @ inverse[:, :, None]
-    rows = chosen.reshape(cells, engine.pieces, -1, count)
+    if not kinks or not rows.shape[2]:
+        hessians = _jumps(engine, root) if kinks else hessians
+        _, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2)[:, :, None] @ hessians @ root[:, :, None])
+        chosen = np.swapaxes(vectors, -1, -2)[..., [-1] if kinks else [0, -1], :] @ inverse[:, :, None]
+        rows = np.concatenate([chosen.reshape(cells, engine.pieces, -1, count), rows], axis=2)
     # what the remainder does not depend on must not help to cull its boxes
     rows[..., np.setdiff1d(np.arange(count), blocks[0][0])] = 0.0
     rows = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-300)  # the spread may be next to nothing
@@ -60,6 +63,16 @@ def _curved(engine: Linearisation) -> Array:
     sign = np.cumprod(np.where(flips < 0, -1.0, 1.0), axis=1)
     rows[:, 1:] *= sign[..., None]
     return rows
+
+
+def _normals(engine: Linearisation) -> Array:
+    """Normals of the kinks that sums of coordinates have, (B, N, K, active): what stays short of them is smooth."""
+    shape, count = (engine.cells, engine.pieces), len(engine.model.active)
+    nothing = np.zeros((*shape, 0, count))
+    if engine.model.planar or not engine.model.kinked:
+        return nothing
+    found = engine.model.kink_normals(engine.frame)
+    return nothing if found.shape[1] > _MOST_KINKS else found.reshape(*shape, -1, count)
 
 
 def _jumps(engine: Linearisation, root: Array) -> Array:

@@ -52,7 +52,8 @@ def initial_cells(problem: Problem, cells: int | Cells | None = None) -> Cells:
     """
     if isinstance(cells, Cells):
         return cells
-    if cells is not None and (isinstance(cells, bool) or int(cells) != cells or cells < 1):
+    number = isinstance(cells, (int, float, np.integer)) and not isinstance(cells, bool)
+    if cells is not None and not (number and cells >= 1 and cells % 1 == 0):
         raise ValueError(f"`cells` must be a positive integer (parts along each side), got {cells!r}.")
     start = problem.initial
     if start.random:

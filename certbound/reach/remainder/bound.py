@@ -113,13 +113,8 @@ class Remainder(Derivatives):
         asked = _Asked(inner, Polytope(low[:, count:], high[:, count:], rows), *_EFFORT[effort], target, only)
         if self.apart:
             lower, upper = self._one_by_one(expansion, asked)
-        elif len(self.blocks) == 1:
-            lower, upper = self._group(expansion, self.blocks[0], asked)
         else:
-            total = base = self._at_nominal(frame)
-            for group in self.blocks:
-                total = total + (Interval(*self._group(expansion, group, replace(asked, target=None))) - base)
-            lower, upper = total.lo, total.hi
+            lower, upper = self._together(expansion, asked)
         if extra is not None:
             total = Interval(lower, upper) + extra
             lower, upper = total.lo, total.hi
@@ -169,14 +164,25 @@ class Remainder(Derivatives):
         reach = Interval(frame.disturbance_low, frame.disturbance_high) - frame.disturbance_middle
         return ((gain - frame.input_gain) * reach[None, None, :]).sum(axis=-1)
 
+    def _together(self, expansion: Expansion, asked: _Asked) -> tuple[Array, Array]:
+        """Bounds of all outputs over the boxes of each group."""
+        if len(self.blocks) == 1:
+            return self._group(expansion, self.blocks[0], asked)
+        total = base = self._at_nominal(expansion.frame)
+        for group in self.blocks:
+            total = total + (Interval(*self._group(expansion, group, replace(asked, target=None))) - base)
+        return total.lo, total.hi
+
     @cached_property
     def apart(self) -> dict[tuple[int, ...], list[int]]:
         """Outputs by the places in ``active`` of what they depend on nonlinearly, where that is less than all of many.
 
-        Empty where one search over all coordinates does as well.
+        Or where sums have kinks, whose boxes are culled by rows. Empty where one search over all coordinates does as
+        well, and where an output meets several blocks.
         """
-        block = self.blocks[0][0] if len(self.blocks) == 1 and len(self.blocks[0]) == 1 else []
-        if len(block) < _MANY or self.planar or self.jumping:
+        blocks = [set(block) for group in self.blocks for block in group]
+        many = (len(blocks) == 1 and len(blocks[0]) >= _MANY) or (len(blocks) > 1 and self.kinks_of_sums)
+        if not many or self.planar or self.jumping:
             return {}
         place = {int(state): a for a, state in enumerate(self.active)}
         own: dict[int, set[int]] = {}
@@ -185,7 +191,8 @@ class Remainder(Derivatives):
         found: dict[tuple[int, ...], list[int]] = {}
         for i, places in own.items():
             found.setdefault(tuple(sorted(places)), []).append(i)
-        return found if any(len(places) < len(block) for places in found) else {}
+        within = all(any(block.issuperset(places) for block in blocks) for places in found)
+        return found if within and any(len(places) < sum(map(len, blocks)) for places in found) else {}
 
     def _one_by_one(self, expansion: Expansion, asked: _Asked) -> tuple[Array, Array]:
         """Bounds of every output over boxes that are cut in its own coordinates alone, and whole in all others."""
@@ -199,7 +206,7 @@ class Remainder(Derivatives):
         if np.isfinite(lower).all() and np.isfinite(upper).all():
             return lower, upper
         # boxes that are whole in other coordinates may reach where something else is undefined
-        joint = self._group(expansion, self.blocks[0], asked)
+        joint = self._together(expansion, asked)
         return np.fmax(lower, joint[0]), np.fmin(upper, joint[1])
 
     @np.errstate(over="ignore", invalid="ignore")  # boxes next to all floats: what overflows bounds nothing
@@ -210,7 +217,8 @@ class Remainder(Derivatives):
         boxes = self._first_boxes(group, asked)
         lower, upper = np.full((m, n), np.inf), np.full((m, n), -np.inf)
         inner_lo, inner_hi = lower.copy(), upper.copy()
-        curbed = alone and asked.polytope.rows.shape[1] > 0
+        # boxes of one of several blocks are 0 in all others, of which constraints say nothing then
+        curbed = alone and asked.polytope.rows.shape[1] > 0 and (asked.outputs is not None or len(self.blocks) == 1)
         before = np.full(len(boxes), np.inf)  # by how much the box that a box was cut from exceeded
         for step in range(asked.rounds + 1):
             poll()
@@ -232,7 +240,8 @@ class Remainder(Derivatives):
             else:
                 excess = asked.excess(lo, hi, inner_lo, inner_hi, items, expansion.nominal)
             largest = excess.max(axis=1)
-            moving = np.isinf(before) | expansion.model.planar  # planes may need cuts on both sides to come closer
+            # planes may need cuts on both sides to come closer, and what lies beyond kinks is culled late
+            moving = np.isinf(before) | expansion.model.planar | expansion.model.kinked
             worst = (largest > 0) & ((largest < _STALLED * before) | moving)
             if alone:
                 worst &= (np.bincount(items[worst], minlength=m) <= _CROWD)[items]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval
+
+_NOTHING = 1e-9  # of a direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +125,17 @@ class Derivatives:
         """Whether the dynamics may jump."""
         return any(node.op in JUMPS for node in self.value.nodes)
 
+    @cached_property
+    def _kinks(self) -> Tape:
+        """What kinks are zeros of."""
+        sides = sorted({node.args[0] for node in self.varying.nodes if node.op == "kink"})
+        return replace(self.varying, outputs=tuple(sides), shape=(len(sides),))
+
+    @cached_property
+    def kinks_of_sums(self) -> bool:
+        """Whether something of several states has a kink."""
+        return any(sum(slot - 1 in self.active for slot in slots) > 1 for slots in sources(self._kinks))
+
     def _colours(self) -> list[list[list[int]]]:
         """Blocks of coupled active coordinates, grouped so that no output meets two blocks of one group."""
         position = {int(state): a for a, state in enumerate(self.active)}
@@ -209,6 +223,19 @@ class Derivatives:
         for column, (i, j) in enumerate(self.entries):
             result[:, :, outputs.index(i), int(np.searchsorted(self.active, j))] = values[..., column]
         return np.where(np.isfinite(result), result, 0.0)
+
+    def kink_normals(self, frame: Frame) -> Array:
+        """Normals at the middle of the pieces of the kinks of sums of active coordinates, each once: (M, K, active)."""
+        n, count = self.problem.system.dimension, len(self._kinks.outputs)
+        slopes = jacobian(self._kinks, range(1, n + 1))
+        values = compile_numpy(slopes)(*self.shifted(frame, np.zeros((len(frame), 1, len(self.active)))))
+        normals = np.nan_to_num(values.reshape(len(frame), count, n)[..., self.active], posinf=0.0, neginf=0.0)
+        size = np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0)
+        alike = np.abs(np.einsum("mia,mja->mij", normals, normals))
+        new = [i for i in range(count) if np.any(np.count_nonzero(np.abs(normals[:, i]) > _NOTHING, axis=1) > 1)
+               and not np.any(np.all(alike[:, i, :i] > 1 - _NOTHING, axis=0))]  # fmt: skip
+        return np.asarray(normals[:, new])
 
     def shifted(self, frame: Frame, shift: Array) -> list[Array]:
         """The inputs of the tape at the middle of the pieces, one row a deviation ``shift`` (M, K, active)."""

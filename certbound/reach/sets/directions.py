@@ -17,6 +17,7 @@ from certbound.constants.enclosures import enclose
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside, Quadratic, Region
+from certbound.problem.systems import System
 from certbound.reach.sets.separation import polyhedral_weights
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
@@ -75,7 +76,7 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
     found = []
     for number, constraint in enumerate(problem.constraints):
         own, needed = number if number < len(problem.safe) else -1, curve.required(constraint.during)
-        for label, rows, room in _constraint(constraint, curve, problem.system.states):
+        for label, rows, room in _constraint(constraint, curve, problem.system):
             found.append(Requirement(label=label, constraint=own, rows=rows, room=np.where(needed, room, np.inf)))
     return found
 
@@ -83,7 +84,7 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
 Rows = Iterator[tuple[str, Array, Array]]
 
 
-def _constraint(constraint: Inside, curve: NominalPieces, states: tuple[str, ...]) -> Rows:
+def _constraint(constraint: Inside, curve: NominalPieces, system: System) -> Rows:
     region, label = constraint.region, str(constraint.label)
     match region.form:
         case Quadratic() as form if constraint.outside:
@@ -96,21 +97,22 @@ def _constraint(constraint: Inside, curve: NominalPieces, states: tuple[str, ...
             a, b = _facets(region, form, curve)
             for index in range(len(a)):
                 rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
-                side, text = _side(region, a[index], index, states), label
+                side, text = _side(region, a[index], index, system), label
                 if len(a) > 1:
-                    named = region.kind != "box" or label != region.describe(states, constraint.word)
+                    named = region.kind != "box" or label != region.describe(system.states, constraint.word)
                     text = side if side and not named else f"{label}, side {index + 1}{side and f' ({side})'}"
                 yield text, rows, curve.least(rows, b[:, index])
 
 
-def _side(region: Region, row: Array, index: int, states: tuple[str, ...]) -> str:
+def _side(region: Region, row: Array, index: int, system: System) -> str:
     """One side of a resting set as an inequality."""
     if region.moving or not isinstance(region.form, Faces):
         return ""
     bound = float(region.form.bounds[index] + region.form.normals[index] @ region.center_at())
+    row = system.said_of(row)
     sign = -1.0 if np.count_nonzero(row) == 1 and row.sum() < 0 else 1.0
     factors = {1.0: "", -1.0: "-"}
-    parts = [f"{factors.get(sign * a, f'{sign * a:g}*')}{name}" for a, name in zip(row, states) if a]
+    parts = [f"{factors.get(sign * a, f'{sign * a:g}*')}{name}" for a, name in zip(row, system.states) if a]
     return f"{' + '.join(parts).replace('+ -', '- ')} {'<=' if sign > 0 else '>='} {sign * bound + 0.0:g}"
 
 

@@ -30,6 +30,7 @@ from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
+from certbound.problem.sets import check_start
 from certbound.reach.contraction import (
     contraction_tube,
     local_constants,
@@ -82,6 +83,8 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     before the horizon.
     """
     problem = in_pieces(problem)
+    if problem.system.time == "discrete":
+        check_start(problem.initial, problem.safe, apart=True)
     method, constants, quick = asked.method, asked.constants, asked.quick
     if constants is not None:
         refuse_contradiction(problem, constants)
@@ -270,8 +273,9 @@ class _Work:
     @property
     def _narrower(self) -> str:
         """The beginning of a cure: cells where the initial set can be split."""
-        hull = self.problem.initial.hull()
-        return "split the initial set (cells), or try" if np.any(hull.lo < hull.hi) else "try"
+        start = self.problem.initial
+        wide = not start.random and np.any(start.hull().lo < start.hull().hi)
+        return "split the initial set (cells), or try" if wide else "try"
 
     def _when(self, time: float) -> str:
         return f"t = {time:.4g}" if self.flow.continuous else f"step {time:g}"

@@ -19,6 +19,7 @@ import numpy as np
 from flint import arb
 
 from certbound.arrays import Array
+from certbound.checks import assign
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, in_logarithms, jacobian, turned_tape
 from certbound.problem.problem import Problem
@@ -136,6 +137,7 @@ def turned_problem(problem: Problem, matrix: Array, inverse: Array) -> Problem:
         turned_tape(problem.closed_loop, inverse, matrix)[0], states=system.states,
         diffusion=_diffusion(system.diffusion, matrix, inverse), **signals,
     )  # fmt: skip
+    assign(turned, turn=matrix)
     safe = [_constraint(one, inverse, moved) for one in problem.safe]
     start, plan = _start(problem, matrix), None if law else problem.plan
     try:

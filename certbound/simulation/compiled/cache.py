@@ -9,6 +9,7 @@ generated, never one read from disk.
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import logging
@@ -27,6 +28,7 @@ from certbound._version import __version__
 from certbound.lazy import uncollected
 from certbound.simulation.compiled.entry import FOLLOW, KERNEL, enter, entered
 from certbound.simulation.compiled.particles import replicate
+from certbound.simulation.compiled.translation import translatable, translated
 from certbound.watch import undisturbed
 
 logger = logging.getLogger(__name__)
@@ -101,7 +103,7 @@ def _fingerprint() -> str:
     import numba
 
     here = Path(__file__)
-    names = ("cache.py", "elementary.py", "entry.py", "particles.py", "streams.py", "supremum.py")
+    names = ("cache.py", "elementary.py", "entry.py", "particles.py", "streams.py", "supremum.py", "translation.py")
     helpers = b"".join(here.with_name(name).read_bytes() for name in names)
     return f"{__version__} {numba.__version__} {sys.version} {hashlib.sha256(helpers).hexdigest()}"
 
@@ -135,7 +137,10 @@ def _run(digest: str, source: str, folder: Path | None) -> Callable[..., Any]:
         _store(path, text.encode())
         _drop_damaged(path)
     # The text was written by this package a moment ago, from a validated tape.
-    exec(compile(text, str(path or f"<kernel {digest}>"), "exec"), module.__dict__)  # noqa: S102
+    tree = ast.parse(text)
+    if translatable(tree):
+        tree = translated(tree, module.__dict__)
+    exec(compile(tree, str(path or f"<kernel {digest}>"), "exec"), module.__dict__)  # noqa: S102
     if path is not None:
         _seal(path)
     return entered(module.run, ((KERNEL, enter), (FOLLOW, replicate)))

@@ -288,7 +288,8 @@ def _patches_in_plane(data: Array, steps: Array, axes: tuple[Array, ...]) -> Pat
     widths = _cell_widths(axes, len(steps))
     count = len(widths[0])
     coefficients, reference, size = np.empty((count, 4, 6, 6)), np.empty(count), np.empty(count)
-    bernstein_in_plane(data, np.ascontiguousarray(steps), first, second, coefficients, reference, size)
+    data, steps = np.ascontiguousarray(data), np.ascontiguousarray(steps)  # compiled for one layout
+    bernstein_in_plane(data, steps, first, second, coefficients, reference, size)
     step = np.repeat(steps, count // len(steps))
     return Patches(coefficients=coefficients, reference=reference, size=size, step=step, widths=widths)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from certbound.rigor.intervals import Interval, abs_, exp, sq
 
-KAPPA = 1.3
+KAPPA = 1.4
 """Ratio of the standard deviations of the dominating density and of the noise."""
 _STEPS = 128
 _REACH = 30  # where the supremum is surely past its peak
@@ -52,7 +52,7 @@ def dominance(order: int, rho: float = 0.0, power: int = 0, stretch: float = 1.0
         weight = weight * (z + 1.0)
     exponent = sq(z * stretch + rho) / Interval.point(2 * KAPPA**2) - sq(z) * 0.5
     value = weight * exp(exponent) * KAPPA
-    # beyond the reach: (1 + z)^(k + p) exp(...) bounds it, whose logarithm falls there (k + p <= 12, kappa = 1.3)
+    # beyond the reach: (1 + z)^(k + p) exp(...) bounds it, whose logarithm falls there (k + p <= 12, kappa = 1.4)
     last = Interval.point(float(_REACH))
     beyond = exp(sq(last * stretch + rho) / Interval.point(2 * KAPPA**2) - sq(last) * 0.5) * KAPPA
     for _ in range(order + power):
@@ -90,19 +90,21 @@ def density_tail(order: int, z: float) -> float:
 
 
 @lru_cache(maxsize=256)
-def quadrature_error(points: int, half: float, order: int, reach: float, ratio: float = KAPPA) -> float:
+def quadrature_error(
+    points: int, half: float, order: int, reach: float, ratio: float = KAPPA, degree: int = 2
+) -> float:
     """Error of Gauss's rule for He_k(z) phi(z) times a basis function, in units of the mass of phi_{ratio s}.
 
     Proves: on an interval of half-width ``half`` (in units of s), centred at |z0| <= ``reach``, the rule with
     ``points`` points is off by at most the returned number times that mass of the interval, for a basis
-    function that is a polynomial of degree at most 2 with |b| <= 1 on the interval.
+    function that is a polynomial of degree at most ``degree``, 2 or 3, with |b| <= 1 on the interval.
 
     The rule is exact for degree N = 2 points - 1 and its weights are positive, so the error is at most 4 ||g - p||
     (interval of length 2), and ||g - p|| <= 2 M rho^-N/(rho - 1), M = sup |g| on the Bernstein ellipse of rho: there
-    |phi(z)| <= exp(-(|z0| - half A)_+^2/2 + half^2 B^2/2)/sqrt(2 pi) with the half-axes A, B, |b| <= (2 A)^2 (a
-    polynomial of degree 2 bounded by 1 on [-1, 1] is at most |T_2| <= 2 A^2 + 2 B^2 + 1 there) and |He_k(z)| <= (1 +
-    |z|)^k for k <= 3, three times that for k = 4. The mass is at least the width times the least density. The supremum
-    over z0 is taken in pieces.
+    |phi(z)| <= exp(-(|z0| - half A)_+^2/2 + half^2 B^2/2)/sqrt(2 pi) with the half-axes A, B, |b| <= 2 A^2 + 2 B^2 + 1
+    (a polynomial of degree 2 bounded by 1 on [-1, 1] is at most |T_2| there; one of degree 3 at most rho^3) and
+    |He_k(z)| <= (1 + |z|)^k for k <= 3, three times that for k = 4. The mass is at least the width times the least
+    density. The supremum over z0 is taken in pieces.
     """
     left = np.arange(0.0, reach, 1 / 16)
     right = left + 1 / 16
@@ -110,9 +112,10 @@ def quadrature_error(points: int, half: float, order: int, reach: float, ratio: 
     more = math.log(3) if order == 4 else 0.0
     for rho in (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0, 192.0, 256.0):
         a, b = (rho + 1 / rho) / 2, (rho - 1 / rho) / 2
+        widest = math.log(2 * a * a + 2 * b * b + 1) if degree == 2 else 3 * math.log(rho)
         nearest = np.maximum(left - half * a, 0.0)
         size = right + half * (a + b)
         exponent = -(nearest**2) / 2 + (half * b) ** 2 / 2 + (right + half) ** 2 / (2 * ratio**2)
-        exponent += np.log(1 + size) * order + math.log(2 * a * a + 2 * b * b + 1) - (2 * points - 1) * math.log(rho)
+        exponent += np.log(1 + size) * order + widest - (2 * points - 1) * math.log(rho)
         best = np.minimum(best, exponent + math.log(4 / (rho - 1) * ratio) + more)
     return float(np.exp(best.max())) * (1 + 1e-9)

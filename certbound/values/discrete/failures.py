@@ -14,10 +14,11 @@ import numpy as np
 from certbound.arrays import Array, Mask
 from certbound.problem.goals import check_end
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Box, Inside, Region
+from certbound.problem.sets import Box, Region
 from certbound.problem.systems import DiscreteSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart, Charts, from_probability
+from certbound.values.discrete.cubic import CubicTransition, all_alike, cubic_transition
 from certbound.values.discrete.fields import Tables
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import (
@@ -38,18 +39,20 @@ from certbound.values.discrete.layout import (
     FailureBounds,
     boxes_of,
     grid_of,
+    order_of,
     seconds_of,
     shares_of,
+    start_grid,
     widths_of,
     without_hopeless,
 )
 from certbound.values.discrete.scaled import ScaledDynamics, ScaledTransition, dynamics_of, noise_of
-from certbound.values.discrete.shocks import Inapplicable, Shocks, gaussian_shocks
+from certbound.values.discrete.shocks import Inapplicable, shocks_of_start
 from certbound.values.discrete.steps import Step
 from certbound.values.discrete.transitions import Transition
 from certbound.values.discrete.uniform_noise import LineTables, UniformTables, UniformTransition
 from certbound.values.grids import Grid, corners
-from certbound.values.sets import active_at, box_around, contains, respected
+from certbound.values.sets import active_at, contains, respected
 from certbound.watch import OutOfTime, poll
 
 MOST_STATES = 3
@@ -107,13 +110,12 @@ def bound_failure(
     work = Work(problem, target, parts, since, until)
     begun = time.perf_counter()
     upper, lower, spent = 1.0, 0.0, 0.0
-    tried: list[tuple[float, float, float]] = []
-    cells: tuple[int, ...] = ()
-    shares = shares_of(work.n, work.shocks)
+    tried, cells = list[tuple[float, float, float]](), tuple[int, ...]()
+    shares = work.first_shares(seconds)
     while shares:
         if tried:
             affordable = partial(work.fits, seconds=seconds - spent)
-            shares = without_hopeless(shares, tried[-1], ratio, work.shocks.uniform, affordable)
+            shares = without_hopeless(shares, tried[-1], ratio, order_of(work.shocks, work.cubic), affordable)
         share = shares.pop(0)
         layout = work.layout(share)
         if layout is None:
@@ -134,19 +136,16 @@ def bound_failure(
             break
         spent += cost
         upper, lower, cells = min(upper, found[0]), max(lower, found[1]), finest
+        if not tried:
+            shares = [other for other in shares_of(work.n, work.shocks, cubic=work.cubic) if other < share]
         tried.append((share, *found))
-        settled = spent > _PATIENCE and _settled(upper, lower, delta)
+        settled = delta is not None and spent > _PATIENCE and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
         if upper <= ratio * lower or settled or upper < (_UNIFORM_FLOOR if work.shocks.uniform else _FLOOR):
             break
     seconds = time.perf_counter() - begun
     return FailureBounds(
         upper=upper, lower=lower, cells=cells, share=tried[-1][0], seconds=seconds, tried=tuple(tried)
     )
-
-
-def _settled(upper: float, lower: float, delta: float | None) -> bool:
-    """Whether the question is answered with room to spare."""
-    return delta is not None and (upper <= delta / 100 or lower >= min(100 * delta, 0.5))
 
 
 class Work:
@@ -177,8 +176,10 @@ class Work:
         self.shocks = noise_of(problem, self.dynamics)
         self.boxes: Boxes = boxes_of(problem, self.shocks, self.dynamics)
         self.beyond_below = 0.0 if self.boxes.cut else self.beyond
-        self.random = problem.initial.random
-        self.start_shocks = self._start_shocks()
+        self.start_shocks = shocks_of_start(problem.initial.covariance) if problem.initial.random else None
+        self.random = self.start_shocks is not None
+        self._alike = target is None and all_alike(self.dynamics, self.shocks)
+        self.cubic = False  # whether functions have second derivatives at the nodes
         self._last: tuple[object, AnyTransition] | None = None
         self._lengths: dict[int, list[tuple[Array, Array]]] = {}
         self._starts: dict[float, Grid] = {}
@@ -194,6 +195,13 @@ class Work:
                 "engine, which is at its best there."
             )
 
+    def first_shares(self, seconds: float) -> list[float]:
+        """Sizes of cells to try; such as suit cubics where these may serve, and the first of them costs little."""
+        shares = shares_of(self.n, self.shocks, cubic=True)
+        layout = self.layout(shares[0]) if self._alike else None
+        fits = layout is not None and self.cost(layout) <= seconds / 4 and bool(self.zones(layout[-1], 0).safe.all())
+        return shares if fits else shares_of(self.n, self.shocks)
+
     def cost(self, layout: list[Grid]) -> float:
         """Seconds that a layout stands for, at fixed rates: bounds must not depend on the machine's load."""
         boxes = float(self.dynamics.parts) ** len(self.problem.system.disturbance_names)
@@ -203,19 +211,6 @@ class Work:
         """Whether grids with cells of this size exist and cost no more."""
         layout = self.layout(share)
         return layout is not None and self.cost(layout) <= seconds
-
-    def _start_shocks(self) -> Shocks | None:
-        initial = self.problem.initial
-        if not initial.random or not np.any(initial.covariance):
-            self.random = False
-            return None
-        try:
-            return gaussian_shocks(Interval.point(initial.covariance))
-        except Inapplicable as error:
-            raise Inapplicable(
-                "value functions need a random start with a covariance that is diagonal, or diagonal plus one common "
-                "factor, and positive in every state."
-            ) from error
 
     # ---- grids -----------------------------------------------------------------------------------------------
 
@@ -267,11 +262,15 @@ class Work:
         above = final(grids[last], zones[last], above=True, beyond=self.beyond)
         below = final(grids[last], zones[last], above=False, beyond=self.beyond_below)
         yield last, above, below
+        smooth = self._smooth_step(grids[end:], zones[last])
+        self.cubic = smooth is not None
+        used: AnyTransition | None = None
         with ThreadPoolExecutor(1) as beside:  # one side on another core: neither knows of the other
             for t in range(last - 1, end - 1, -1):
                 poll(f"values at step {t}, {math.prod(grids[t].shape)} cells")
-                before, step = self._last, self._kept_transition(t, grids[t], grids[t + 1], share)
-                if before is self._last and math.prod(grids[t].shape) >= _APART and self.shocks.sizes is None:
+                before, step = used, smooth or self._kept_transition(t, grids[t], grids[t + 1], share)
+                used = step
+                if before is used and math.prod(grids[t].shape) >= _APART and self.shocks.sizes is None:
                     other = beside.submit(back_below, step, below, zones[t])
                     above, below = back_above(step, above, zones[t]), other.result()
                 else:  # what a step keeps for later is made by one thread
@@ -302,6 +301,13 @@ class Work:
                 below = jointly(back_below(step, below[0], plain, *below[1:]), low, done)
         return above, below
 
+    def _smooth_step(self, grids: list[Grid], zones: Zones) -> CubicTransition | None:
+        """The step of all grids, if they are one, all of it safe and smooth."""
+        fits = self._alike and len(grids) > 1 and len({id(grid) for grid in grids}) == 1 and bool(zones.safe.all())
+        found = cubic_transition(self.dynamics, 0, grids[0], self.shocks) if fits else None
+        self._alike = found is not None  # else not tried again
+        return found
+
     def _kept_transition(self, t: int, grid: Grid, after: Grid, share: float) -> AnyTransition:
         """The transition of a step, the same one as long as nothing changes."""
         key = (grid, after, 0 if self.dynamics.steady else t)
@@ -318,6 +324,7 @@ class Work:
         for t, above, below in self._backward(grids, share, 0):
             if t not in steps:
                 continue
+            above, below = above.flat(above=True), below.flat(above=False)
             parts = next((parts for parts in (8, 4, 2) if above.nodal.size * parts**self.n <= _CHARTED), 1)
             active, cells = active_at(self.limits, t), grids[t].cells()
             masks = [*respected(active, cells, t), respected(active, cells, t, interiors=True)[1]]
@@ -341,14 +348,14 @@ class Work:
         if self.shocks.uniform:
             kind = LineTables if self.shocks.laplace or self.shocks.steps is not None else UniformTables
             return UniformTransition(step, kind(after, self.shocks, *step.hull(), fineness=max(2 / share, 4.0)))
-        return Transition(step, Tables(after, self.shocks, *step.hull()))
+        return Transition(step, Tables(after, self.shocks, *step.hull(), cubic=self.cubic))
 
     def at_random(self, above: ValueFunction | Parts, below: ValueFunction | Parts) -> tuple[float, float]:
         """Mean over a Gaussian start: one more convolution, read at the mean."""
         assert self.start_shocks is not None
         mean = self.problem.initial.mean
         tops, bottoms = (one if isinstance(one, tuple) else (one,) for one in (above, below))
-        tables = Tables(tops[0].grid, self.start_shocks, mean, mean)
+        tables = Tables(tops[0].grid, self.start_shocks, mean, mean, cubic=self.cubic)
         point = Grid(axes=tuple(np.array([value]) for value in mean))
         image = (Interval.point(mean[None]), np.ones(1, dtype=bool))
         transition = Transition(Step(grid=point, vertices=[image], cells=[], pieces=np.empty((0, 0))), tables)
@@ -363,7 +370,7 @@ class Work:
         initial = self.problem.initial
         region = Box(initial.mean, initial.mean) if initial.random else initial
         tops, bottoms = (one if isinstance(one, tuple) else (one,) for one in (above, below))
-        grid = self._starts.setdefault(share, self._start_grid(region, share))
+        grid = self._starts.setdefault(share, start_grid(region, self._lengths_at(0, 0), share))
         cells = grid.cells()
         stays = self.target if self.until is not None and self.since == 0 else None
         if stays is not None and not contains(stays, cells, 0)[1].all():
@@ -388,13 +395,3 @@ class Work:
             top = top + np.maximum(-bend[i], 0.0) * transition.step.grid.widths(i) ** 2 / 8 * (1 + 1e-12)
         top = np.where(known, top, 1.0).ravel()[meets]
         return float(top.max())
-
-    def _start_grid(self, region: Region, share: float) -> Grid:
-        low, high = box_around([Inside(region)], self.n, 0)
-        least = 1 if region.form.axial else {1: 1, 2: 24, 3: 10}[self.n]
-        axes = []
-        for i, (places, lengths) in enumerate(self._lengths_at(0, 0)):
-            near = lengths[max(np.searchsorted(places, low[i]) - 1, 0) : np.searchsorted(places, high[i]) + 1]
-            count = max(least, math.ceil((high[i] - low[i]) / (0.7 * share * float(near.min()))))
-            axes.append(np.linspace(low[i], high[i], count + 1) if low[i] < high[i] else np.array([low[i], high[i]]))
-        return Grid(axes=tuple(axes))

@@ -98,10 +98,15 @@ class Tables:
         Ends of a box around the noise-free images.
     fineness : float
         Mesh steps per standard deviation.
+    cubic : bool
+        Whether functions may have second derivatives at the nodes.
     """
 
-    def __init__(self, grid: Grid, shocks: Shocks, low: Array, high: Array, *, fineness: float = FINENESS) -> None:
+    def __init__(
+        self, grid: Grid, shocks: Shocks, low: Array, high: Array, *, fineness: float = FINENESS, cubic: bool = False
+    ) -> None:
         n = grid.dimension
+        self.cubic = cubic
         self.grid, self.shocks, self.n = grid, shocks, n
         self.sigma = shocks.sigma.mid
         self.spread = float((shocks.sigma.rad / self.sigma).max()) + 2 * _UNIT
@@ -149,7 +154,7 @@ class Tables:
         return np.asarray(self.mesh.start[i] + self.mesh.step[i] * index)
 
     def _kernel(self, i: int) -> AxisKernel:
-        return axis_kernel(self._extended(i), self.grid.axes[i], float(self.sigma[i]), self.spread)
+        return axis_kernel(self._extended(i), self.grid.axes[i], float(self.sigma[i]), self.spread, cubic=self.cubic)
 
     def _mixed(self, table: Array) -> Array:
         """The sum over the common factor's values of the shifted table."""
@@ -235,7 +240,7 @@ class Tables:
         return raw
 
     def _parts(self, value: ValueFunction) -> list[Part]:
-        """The function as a sum: the multilinear part, on fixed cells the constant instead, and parabolas."""
+        """The function as a sum: the multilinear part, on fixed cells the constant instead, and parabolas or cubics."""
         names: list[tuple[str, ...]] = [("hat",) * self.n]
         found = [value.nodal]
         if value.fixed is not None and value.fixed.any():
@@ -243,7 +248,8 @@ class Tables:
             found = [np.where(value.fixed, value.level, corner) for corner in corners(value.nodal)]
         for i in range(self.n):
             if np.any(value.bend[i]):
-                names.append(tuple("bubble" if k == i else "whole" for k in range(self.n)))
+                own, other = ("cubic", "hat") if value.curved else ("bubble", "whole")
+                names.append(tuple(own if k == i else other for k in range(self.n)))
                 found.append(-value.bend[i])
         return list(zip(names, found, strict=True))
 

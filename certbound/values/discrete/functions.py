@@ -1,16 +1,17 @@
-"""Functions on a grid: multilinear plus a parabola per axis on every cell, constant on some cells, 1 or 0 outside.
+"""Functions on a grid: multilinear plus a parabola or a cubic per axis, constant on some cells, 1 or 0 outside.
 
 On a cell with node values u and widths D,
     U(x) = (I u)(x) - sum_i b_i (x_i - a_i)(a_i + D_i - x_i)/2,
 I the multilinear interpolation. For phi that is twice differentiable along the axes,
     phi - I_i phi = int G (-d_ii phi) <= -inf d_ii phi * (x_i - a_i)(a_i + D_i - x_i)/2   (G >= 0, Green's function of
 the axis), and phi - I phi = sum_i I_1 ... I_{i-1} (phi - I_i phi) with positive I's: with u >= phi at the nodes and b_i
-<= inf d_ii phi over the cell U lies above phi; with u <= phi and b_i >= sup d_ii phi below it.
+<= inf d_ii phi over the cell U lies above phi; with u <= phi and b_i >= sup d_ii phi below it. Instead of numbers b_i
+there may be functions that are multilinear between values at the nodes (``cubic/cubic_step``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,8 +28,8 @@ class ValueFunction:
     grid : Grid
     nodal : ndarray, shape grid.node_shape
         u.
-    bend : ndarray, shape (n, *grid.shape)
-        b_i per cell; 0 where ``fixed``.
+    bend : ndarray, shape (n, *grid.shape) or (n, *grid.node_shape)
+        b_i per cell; 0 where ``fixed``. Or at the nodes; then nothing is fixed.
     fixed : ndarray of bool, shape grid.shape, or None
         Cells on which the function is a constant; None: there are none.
     level : ndarray, shape grid.shape
@@ -44,10 +45,30 @@ class ValueFunction:
     level: Array
     beyond: float = 1.0
 
+    @property
+    def curved(self) -> bool:
+        """Whether the second derivatives are given at the nodes."""
+        return self.bend.shape[1:] == self.nodal.shape
+
+    def bend_ends(self, i: int) -> tuple[Array, Array]:
+        """The least and the largest b_i on every cell."""
+        bend = self.bend[i]
+        return (over_corners(np.minimum, bend), over_corners(np.maximum, bend)) if self.curved else (bend, bend)
+
+    def flat(self, *, above: bool) -> ValueFunction:
+        """A function with one number b_i a cell, nowhere below this one (``above``), or nowhere above it."""
+        if not self.curved:
+            return self
+        bend = np.stack([self.bend_ends(i)[0 if above else 1] for i in range(self.grid.dimension)])
+        return replace(self, bend=bend)
+
     def size(self) -> Array:
         """Upper bound of the sum of the absolute parts of the function on every cell, shape grid.shape."""
         largest = over_corners(np.maximum, np.abs(self.nodal))
-        parts = sum(np.abs(self.bend[i]) * self.grid.widths(i) ** 2 / 8 for i in range(self.grid.dimension))
+        parts: Array | float = 0.0
+        for i in range(self.grid.dimension):
+            least, most = self.bend_ends(i)
+            parts = parts + np.maximum(-least, most) * self.grid.widths(i) ** 2 / 8
         total = largest + parts
         if self.fixed is not None:
             total = np.where(self.fixed, 2 * largest + np.abs(self.level), total)
@@ -58,8 +79,9 @@ class ValueFunction:
         low, high = over_corners(np.minimum, self.nodal), over_corners(np.maximum, self.nodal)
         for i in range(self.grid.dimension):
             share = self.grid.widths(i) ** 2 / 8 * (1 + 1e-12)
-            low = low - np.maximum(self.bend[i], 0.0) * share
-            high = high + np.maximum(-self.bend[i], 0.0) * share
+            least, most = self.bend_ends(i)
+            low = low - np.maximum(most, 0.0) * share
+            high = high + np.maximum(-least, 0.0) * share
         slack = 1e-12 * (np.abs(low) + np.abs(high))
         if self.fixed is not None:
             low, high = np.where(self.fixed, self.level, low), np.where(self.fixed, self.level, high)
@@ -118,8 +140,15 @@ class ValueFunction:
         for corner in range(2**n):
             bits = [(corner >> i) & 1 for i in range(n)]
             weight = np.prod([share if bit else 1 - share for share, bit in zip(shares, bits)], axis=0)
-            total += weight * self.nodal[tuple(place + bit for place, bit in zip(places, bits))]
-        for i, axis in enumerate(self.grid.axes):
+            node = tuple(place + bit for place, bit in zip(places, bits))
+            total += weight * self.nodal[node]
+            for i, axis in enumerate(self.grid.axes if self.curved else ()):
+                width, share = np.diff(axis)[places[i]], shares[i]
+                arch = share * (1 - share) * width**2 / 6 * (1 + (share if bits[i] else 1 - share))
+                total -= arch * np.prod(
+                    [s if bit else 1 - s for k, (s, bit) in enumerate(zip(shares, bits)) if k != i], axis=0
+                ) * self.bend[(i, *node)]  # fmt: skip
+        for i, axis in enumerate(() if self.curved else self.grid.axes):
             width = axis[places[i] + 1] - axis[places[i]]
             total -= self.bend[(i, *places)] * width**2 * shares[i] * (1 - shares[i]) / 2
         if self.fixed is not None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.problem.sets import Inside, Region
+from certbound.values.discrete.cubic import CubicTransition
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.scaled import ScaledTransition
 from certbound.values.discrete.transitions import Transition
@@ -28,7 +29,7 @@ from certbound.values.discrete.uniform_noise import UniformTransition
 from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
 
-AnyTransition = Transition | UniformTransition | ScaledTransition
+AnyTransition = Transition | CubicTransition | UniformTransition | ScaledTransition
 Parts = tuple[ValueFunction, ...]
 """Functions whose sum is meant."""
 
@@ -80,6 +81,8 @@ def final(grid: Grid, zones: Zones, *, above: bool, beyond: float = 1.0) -> Valu
 
 def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones, *more: ValueFunction) -> ValueFunction:
     """A function at least V_t, given one that is at least V_{t+1}, or several whose sum is."""
+    if isinstance(transition, CubicTransition):
+        return transition.back(value, above=True)
     grid = transition.step.grid
     nodal, bend, known = values_above(transition, value, *more)
     fixed = ~zones.safe | ~known
@@ -122,6 +125,8 @@ def _least_at_nodes(transition: AnyTransition, fields: list[Any]) -> list[Array]
 
 def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones, *more: ValueFunction) -> ValueFunction:
     """A function at most V_t, given one that is at most V_{t+1}, or several whose sum is."""
+    if isinstance(transition, CubicTransition):
+        return transition.back(value, above=False)
     grid = transition.step.grid
     fields: list[Any] = [transition.tables.field(one) for one in (value, *more)]
     options = _least_at_nodes(transition, fields)

@@ -1,7 +1,8 @@
 """Integrals of the basis functions of one axis against the normal density, as banded matrices.
 
 On the interval [x_k, x_{k + 1}] of width D_k with tau = (y - x_k)/D_k the basis functions are L = 1 - tau, R = tau,
-Q = D_k^2 tau (1 - tau)/2 and P = 1; the hat of a node is R to its left and L to its right. For every row m
+Q = D_k^2 tau (1 - tau)/2 and P = 1; the hat of a node is R to its left and L to its right, its cubic
+D_k^2 tau (1 - tau^2)/6 to its left and D_k^2 tau (1 - tau)(2 - tau)/6 to its right. For every row m
     K^(a)[m, k] = d^a/dm^a int b_k(y) phi_s(y - m) dy = int b_k(y) s^-a He_a(z) phi_s(y - m) dy,  z = (y - m)/s,
 is evaluated by Gauss's rule. `AxisKernel.error` bounds what is wrong with an entry, relative to the mass that the
 dominating density phi_{kappa s} has on the interval; see ``dominance``.
@@ -39,7 +40,7 @@ class Block:
     left: int
     right: int
     parts: dict[str, Array]
-    """Name to (ORDERS, rows, intervals); ``hat`` has one column more."""
+    """Name to (ORDERS, rows, intervals); ``hat`` and ``cubic`` have one column more."""
     mass: Array
     """Mass of the dominating density, (rows, intervals)."""
 
@@ -100,8 +101,9 @@ class AxisKernel:
 
 
 def axis_kernel(
-    points: Array, nodes: Array, sigma: float | Array, spread: float, *, orders: int = ORDERS, sides: bool = True
-) -> AxisKernel:
+    points: Array, nodes: Array, sigma: float | Array, spread: float, *, orders: int = ORDERS, sides: bool = True,
+    cubic: bool = False,
+) -> AxisKernel:  # fmt: skip
     """The matrices of one axis.
 
     Parameters
@@ -114,9 +116,12 @@ def axis_kernel(
         Orders of derivatives, at most 5.
     sides : bool
         Whether the halves ``left`` and ``right`` of hats are kept, which take as much memory as all else.
+    cubic : bool
+        Whether cubics are wanted.
     """
     sizes = np.broadcast_to(np.asarray(sigma, dtype=float), points.shape)
-    half, rule = _rule_for(np.diff(nodes), float(np.min(sizes)), orders)
+    degree = 3 if cubic else 2
+    half, rule = _rule_for(np.diff(nodes), float(np.min(sizes)), orders, degree)
     own, widest = np.ndim(sigma) > 0, 0.0
     blocks = []
     for first in range(0, len(points), _ROWS):
@@ -125,9 +130,9 @@ def axis_kernel(
         index = np.flatnonzero((nodes[1:] >= rows.min() - near) & (nodes[:-1] <= rows.max() + near))
         left, right = (int(index[0]), int(index[-1]) + 1) if len(index) else (0, 0)
         if own:
-            half, rule = _rule_for(np.diff(nodes[left : right + 1]), float(size.min()), orders)
+            half, rule = _rule_for(np.diff(nodes[left : right + 1]), float(size.min()), orders, degree)
         widest = max(widest, half)
-        parts, mass = _integrals(rows, nodes[left : right + 1], size, *rule, orders)
+        parts, mass = _integrals(rows, nodes[left : right + 1], size, *rule, orders, cubic)
         kept = parts if sides else {name: part for name, part in parts.items() if name not in ("left", "right")}
         blocks.append(Block(first=first, last=first + len(rows), left=left, right=right, parts=kept, mass=mass))
     scale = float(max(np.abs(nodes).max(), np.abs(points).max())) / float(np.min(sizes))
@@ -143,22 +148,22 @@ def axis_kernel(
     )
 
 
-def _rule_for(widths: Array, sigma: float, orders: int) -> tuple[float, tuple[Array, Array]]:
+def _rule_for(widths: Array, sigma: float, orders: int, degree: int) -> tuple[float, tuple[Array, Array]]:
     """Half the width of a panel in units of sigma, and a rule that suffices for it."""
     longest = float(widths.max(initial=0.0)) / sigma
     panels = max(1, math.ceil(longest / 0.9))
     half = longest / panels / 2 * (1 + 1e-9)
     if orders > ORDERS:  # rules are shared by rows whose standard deviations are nearly alike
         half = math.ceil(half * 64 + 1e-9) / 64
-    return half, _rule(_points(half, orders), panels)
+    return half, _rule(_points(half, orders, degree), panels)
 
 
 @lru_cache(maxsize=256)
-def _points(half: float, orders: int) -> int:
+def _points(half: float, orders: int, degree: int) -> int:
     """Points of the rule that suffice for the derivatives and, to 1e-4 of themselves, for the masses."""
 
     def fits(count: int) -> bool:
-        wrong = max(quadrature_error(count, half, order, _FARTHEST) for order in range(orders))
+        wrong = max(quadrature_error(count, half, order, _FARTHEST, degree=degree) for order in range(orders))
         return wrong <= _WANTED and quadrature_error(count, half / KAPPA, 0, (REACH + 1) / KAPPA, 1.0) <= 1e-4
 
     return next(count for count in range(4, 64) if fits(count))
@@ -175,7 +180,7 @@ def _rule(count: int, panels: int) -> tuple[Array, Array]:
 
 
 def _integrals(
-    rows: Array, nodes: Array, sizes: Array, place: Array, weight: Array, orders: int
+    rows: Array, nodes: Array, sizes: Array, place: Array, weight: Array, orders: int, cubic: bool
 ) -> tuple[dict[str, Array], Array]:
     widths, sigma = np.diff(nodes), sizes[:, None, None]
     y = nodes[:-1, None] + widths[:, None] * place
@@ -184,18 +189,28 @@ def _integrals(
     gap = np.maximum(nodes[:-1] - rows[:, None], rows[:, None] - nodes[1:])
     near = (gap <= _MARGIN * sigma[:, :, 0])[:, :, None]
     density *= near
-    shapes = np.stack([1 - place, place, place * (1 - place) / 2, np.ones_like(place)], axis=1) * weight[:, None]
+    basis = [1 - place, place, place * (1 - place) / 2, np.ones_like(place)]
+    if cubic:
+        basis += [place * (1 - place) * (2 - place) / 6, place * (1 - place) * (1 + place) / 6]
+    shapes = np.stack(basis, axis=1) * weight[:, None]
     moments = [density, density * z / sigma, density * (z * z - 1) / sigma**2]
     if orders > ORDERS:
         moments += [density * (z * (z * z - 3)) / sigma**3, density * (z * z * (z * z - 6) + 3) / sigma**4]
-    values = np.moveaxis(np.stack(moments[:orders]) @ shapes, -1, 0) * widths  # (4, orders, rows, intervals)
-    left, right, bubble, whole = values
-    hat = np.zeros((orders, len(rows), len(nodes)))
-    hat[..., :-1] += left
-    hat[..., 1:] += right
-    parts = {"hat": hat, "left": left, "right": right, "bubble": bubble * widths**2, "whole": whole}
+    values = np.moveaxis(np.stack(moments[:orders]) @ shapes, -1, 0) * widths  # (basis, orders, rows, intervals)
+    left, right, bubble, whole = values[:4]
+    parts = {"hat": _joined(left, right), "left": left, "right": right, "bubble": bubble * widths**2, "whole": whole}
+    if cubic:
+        parts["cubic"] = _joined(*(values[4:] * widths**2))
     wide = np.exp(-0.5 * (z / KAPPA) ** 2) / (KAPPA * sigma * math.sqrt(2 * math.pi)) * near
     return parts, (wide @ weight) * widths
+
+
+def _joined(left: Array, right: Array) -> Array:
+    """What a node has to its right, and to its left."""
+    found = np.zeros((*left.shape[:-1], left.shape[-1] + 1))
+    found[..., :-1] += left
+    found[..., 1:] += right
+    return found
 
 
 def _outside(points: Array, low: float, high: float, sigma: float | Array, orders: int) -> tuple[Array, Array]:

@@ -253,6 +253,19 @@ def _finer(
             return np.where(near, np.minimum(widths, fine), widths), []
 
 
+def start_grid(region: Region, lengths: list[tuple[Array, Array]], share: float) -> Grid:
+    """A grid of its own over the starts, its cells no larger than .7 ``share`` of the least length there."""
+    n, around = len(lengths), region.hull()
+    low, high = around.lo, around.hi
+    least = 1 if region.form.axial else {1: 1, 2: 24, 3: 10}[n]
+    axes = []
+    for i, (places, wanted) in enumerate(lengths):
+        near = wanted[max(np.searchsorted(places, low[i]) - 1, 0) : np.searchsorted(places, high[i]) + 1]
+        count = max(least, math.ceil((high[i] - low[i]) / (0.7 * share * float(near.min()))))
+        axes.append(np.linspace(low[i], high[i], count + 1) if low[i] < high[i] else np.array([low[i], high[i]]))
+    return Grid(axes=tuple(axes))
+
+
 _SHARES = {
     1: (0.33, 0.15, 0.07, 0.035, 0.0175, 0.01),
     2: (0.5, 0.33, 0.22, 0.2, 0.15, 0.1, 0.07, 0.05, 0.035),
@@ -266,7 +279,12 @@ _UNIFORM_SHARES = {
 }
 _SCALED_SHARES = (0.33, 0.24, 0.18, 0.13, 0.1)
 _CELL_SECONDS = 4e-6  # what a cell takes for one step, both bounds; measured once
-_ORDER, _UNIFORM_ORDER = 2.5, 2.0
+_CUBIC_SHARES = {
+    1: (0.33, 0.2, 0.12, 0.07, 0.035, 0.0175, 0.01),
+    2: (0.43, 0.4, 0.37, 0.34, 0.3, 0.26, 0.22, 0.18, 0.15, 0.1, 0.07, 0.05, 0.035),
+    3: (0.3, 0.26, 0.22, 0.19, 0.16, 0.13, 0.1, 0.07),
+}
+_ORDER, _UNIFORM_ORDER, _CUBIC_ORDER = 2.5, 2.0, 5.5
 """About the power of the cells' size with which the logarithm of upper over lower falls; measured."""
 _COMMON_FACTOR = 20.0  # how much more that is with a common factor in the noise
 _UNIFORM_FACTOR = 0.4
@@ -310,8 +328,10 @@ class FailureBounds:
     before: tuple[int, float, float] | None = None
 
 
-def shares_of(states: int, shocks: Shocks) -> list[float]:
+def shares_of(states: int, shocks: Shocks, *, cubic: bool = False) -> list[float]:
     """Sizes of the cells that are tried, relative to the lengths over which the solution changes."""
+    if cubic:
+        return list(_CUBIC_SHARES[states])
     if shocks.sizes is not None:
         return list(_SCALED_SHARES)
     return list((_UNIFORM_SHARES if shocks.uniform else _SHARES)[states])
@@ -324,8 +344,13 @@ def seconds_of(layout: list[Grid], shocks: Shocks) -> float:
     return rate * sum(_OVERHEAD + math.prod(grid.shape) for grid in layout)
 
 
+def order_of(shocks: Shocks, cubic: bool) -> float:
+    """About the power of the cells' size with which the logarithm of upper over lower falls."""
+    return _CUBIC_ORDER if cubic else _UNIFORM_ORDER if shocks.uniform else _ORDER
+
+
 def without_hopeless(
-    shares: list[float], last: tuple[float, float, float], ratio: float, uniform: bool,
+    shares: list[float], last: tuple[float, float, float], ratio: float, order: float,
     affordable: Callable[[float], bool],
 ) -> list[float]:  # fmt: skip
     """The shares without those that would leave upper > ratio * lower, as long as the next one is affordable.
@@ -338,15 +363,16 @@ def without_hopeless(
         The share of the last grid, upper and lower.
     ratio : float
         What is wanted.
-    uniform : bool
-        Whether the noise is.
+    order : float
+        As `order_of` has it.
     affordable : callable
         Whether a share may be tried.
     """
     share, upper, lower = last
     if not 0 < lower < upper < _WIDEST * lower:
         return shares
-    wanted = share * (math.log(ratio) / math.log(upper / lower)) ** (1 / (_UNIFORM_ORDER if uniform else _ORDER))
-    while len(shares) > 1 and shares[0] > _NEARLY * wanted and affordable(shares[1]):
+    wanted = share * (math.log(ratio) / math.log(upper / lower)) ** (1 / order)
+    nearly = _NEARLY if order < _CUBIC_ORDER else 1.0
+    while len(shares) > 1 and shares[0] > nearly * wanted and affordable(shares[1]):
         shares = shares[1:]
     return shares

@@ -145,6 +145,25 @@ def gaussian_shocks(covariance: Interval) -> Shocks:
     return Shocks(sigma=sigma, factor=factor)
 
 
+def shocks_of_start(covariance: Array) -> Shocks | None:
+    """A normal start about its mean; None where it is certain.
+
+    Raises
+    ------
+    Inapplicable
+        If its covariance is neither diagonal nor that plus one common factor, or a state is certain.
+    """
+    if not np.any(covariance):
+        return None
+    try:
+        return gaussian_shocks(Interval.point(covariance))
+    except Inapplicable as error:
+        raise Inapplicable(
+            "value functions need a random start with a covariance that is diagonal, or diagonal plus one common "
+            "factor, and positive in every state."
+        ) from error
+
+
 def _check_sizes(sigma: Interval) -> None:
     """Refuse units in which the noise is so small or so large that floats end."""
     for i, (low, high) in enumerate(zip(sigma.lo, sigma.hi)):

@@ -116,7 +116,7 @@ class Dynamics:
         low, high = self._disturbances()
         vertices = [self._nodes(t, grid, Interval.point(vertex)) for vertex in _vertices(low, high, self.parts)]
         boxes = _boxes(low, high, self.parts)
-        cells = [self._cells(t, grid, box) for box in boxes]
+        cells = [self.over(t, grid.cells(), box) for box in boxes]
         pieces = np.array([box.width for box in boxes]).reshape(len(boxes), len(low))
         return Step(grid=grid, vertices=vertices, cells=cells, pieces=pieces)
 
@@ -134,8 +134,8 @@ class Dynamics:
         image, undefined, _ = evaluate(self.tape, self.arguments(t, Interval.point(grid.nodes()), vertex))
         return image, ~undefined & np.isfinite(image.lo).all(axis=1) & np.isfinite(image.hi).all(axis=1)
 
-    def _cells(self, t: int, grid: Grid, box: Interval) -> CellImages:
-        boxes = grid.cells()
+    def over(self, t: int, boxes: Interval, box: Interval) -> CellImages:
+        """f and its derivatives over boxes of states, shape (boxes, n), and one box of disturbances."""
         whole = self.arguments(t, boxes, box)
         image, undefined, jumps = evaluate(self.tape, whole)
         slopes, bad_slopes, kinks = evaluate(self.slopes, whole)

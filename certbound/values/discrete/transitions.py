@@ -28,7 +28,7 @@ _DIRECT = 16  # entries of windows, in units of the table's, below which they ar
 
 
 @lru_cache(maxsize=8)
-def _rule_constants(points: int) -> tuple[float, float]:
+def rule_constants(points: int) -> tuple[float, float]:
     """Lambda and omega_p of the interpolation on the middle interval, rounded up."""
     first = -(points // 2 - 1)
     theta = Interval(np.arange(256) / 256, np.arange(1, 257) / 256)
@@ -138,12 +138,12 @@ class Windows:
                 continue
             part = table
             for axis, width in enumerate(size):
-                part = _sliding(pick, part, width, axis)
+                part = sliding(pick, part, width, axis)
             found[members] = part.ravel().take(flat)
         return found
 
 
-def _sliding(pick: np.ufunc, table: Array, width: int, axis: int) -> Array:
+def sliding(pick: np.ufunc, table: Array, width: int, axis: int) -> Array:
     """The extreme over ``width`` entries from every entry on along an axis (fewer at the end), by doubling."""
     moved = np.moveaxis(table, axis, 0)
     done = 1
@@ -165,7 +165,7 @@ class Transition:
         self.windows, self.forms = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         ratio = tables.mesh.step / tables.sigma
         self._ratio = ratio
-        norm, omega = _rule_constants(POINTS)
+        norm, omega = rule_constants(POINTS)
         reach = [min(float(r) * POINTS / 2, 3.0) for r in ratio]
         mass = [dominance(0, r) for r in reach]
         self.missing = sum(
@@ -196,7 +196,7 @@ class Transition:
         zero = (0,) * self.n
         table, wide = field.tables[zero], field.dominant
         for axis in range(self.n):
-            wide = _sliding(np.maximum, wide, POINTS, axis)
+            wide = sliding(np.maximum, wide, POINTS, axis)
         found = []
         for places in self.places:
             value = places.interpolate(table)
@@ -325,6 +325,11 @@ class Forms:
     def terms(self, i: int) -> list[tuple[Alpha, Interval]]:
         """Constant factors of h's second derivatives in d_ii phi."""
         return [(alpha, factor) for alpha, factor in self.square[i] if factor is not None]
+
+    def every(self, i: int) -> list[tuple[Alpha, Interval]]:
+        """Factors of h's first and second derivatives in d_ii phi."""
+        bent = [(_unit(k, self.n), factor) for k, factor in enumerate(self.bent[i])]
+        return [(alpha, factor) for alpha, factor in self.square[i] + bent if factor is not None]
 
     def first(self, over: dict[Alpha, Interval], i: int) -> Interval:
         """d_i phi."""

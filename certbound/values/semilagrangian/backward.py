@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.values.grids import around_nodes, corners
+from certbound.values.grids import around_nodes, corners, over_corners
 from certbound.values.scouting import Reached
 from certbound.values.semilagrangian.bands import NOWHERE, Band, Frame, narrowed, through
 from certbound.values.semilagrangian.confines import TWICE
@@ -114,15 +114,20 @@ def back(frame: Frame, bands: list[Band], bounds: Bounds, value: Lines) -> Lines
 
 
 def limited(frame: Frame, bounds: Bounds, nodal: Array, bend: Array) -> Lines:
-    """Raise a function to its levels, and lower it to 1 (-L: to 0) where it is at least that all around."""
+    """Raise a function to its levels, and lower it to 1 (-L: to 0) where it is at least that all around.
+
+    In the cells around a node that is lowered no line lies below its chords any more: else between lines the function
+    would be less than 1 there, and less than what was stepped.
+    """
     cap = 0.0 if bounds.below else 1.0
     raised = np.maximum(nodal, bounds.level)
     fixed = bounds.fixed | (raised > nodal) if bounds.below else bounds.fixed.copy()
     full = np.minimum.reduce(corners(raised)) >= cap
     capped = (around_nodes((~full).astype(float), largest=True) <= 0) & (bounds.level <= cap)
     nodal = np.where(capped, cap, raised)
-    fixed |= capped
-    sides = fixed[:, :-1] | fixed[:, 1:]
+    sides, beside = fixed[:, :-1] | fixed[:, 1:], over_corners(np.maximum, capped.astype(float)) > 0
+    sides[:-1] |= beside
+    sides[1:] |= beside
     bend = np.where(sides, np.maximum(bend, 0.0), bend)
     for mirror in bounds.mirrors:
         nodal = _mirrored(mirror, bounds, nodal, bend, np.diff(frame.q))

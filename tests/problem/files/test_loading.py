@@ -152,6 +152,7 @@ def test_a_thousand_chained_definitions_are_read():
         ("[[stay]]", "[stay]", r"`stay` must be a list of tables; write \[\[stay\]\]"),
         ("[noise]\ndiffusion = ", "[noise]\nlaw = 'uniform'\nlow = -1\nq = ", "write halfwidth = 0.1 for"),
         ("[noise]", "[nosie]", "unknown key 'nosie' in the problem file; did you mean 'noise'"),
+        ("[noise]", "[constants]\nc = 1\n[noise]", "unknown key 'constants'.*; did you mean 'parameters'"),
         ("[noise]\n", "noise = 0.1\n[nois]\n", "unknown key|is wrong"),
         ("delta = 1e-3", "delta = 1e-3\nnoise = 0.1\n[junk]\n", "unknown key 'junk'|TOML"),
         ("time = ", "time == ", "the problem file is not TOML"),

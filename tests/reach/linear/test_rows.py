@@ -95,3 +95,30 @@ def test_an_actuator_that_is_far_from_its_limits_in_spread_leaves_no_remainder()
     normal = extra[0, 20, 0] / extra[0, 20, 0, 0]
     np.testing.assert_allclose(normal, [1.0, 1.2], rtol=1e-6)
     assert linear_answer(problem).log10_delta < -4
+
+
+def followers() -> cb.Problem:
+    """Two followers that keep 10 m, whose accelerations saturate at seven standard deviations of what is asked."""
+
+    def step(x: Any) -> list[Any]:
+        asked = [0.6 * (x[0] - 10) - 1.2 * x[1], 0.6 * (x[2] - 10) + 0.9 * (x[1] - x[3])]
+        first, second = (np.maximum(np.minimum(a, 2), -2) for a in asked)
+        return [x[0] - 0.1 * x[1], x[1] + 0.1 * first, x[2] + 0.1 * (x[1] - x[3]), x[3] + 0.1 * second]
+
+    system = cb.DiscreteSystem(step, states=4, noise=cb.Gaussian(std=[1e-9, 0.08, 1e-9, 0.08]))
+    safe = [cb.Inside(cb.Box([7, -9, 7, -9], [13, 9, 13, 9]))]
+    return cb.Problem(system, initial=[10, 0, 10, 0], safe=safe, horizon=70)
+
+
+def test_normals_of_kinks_are_rows_once_each_however_far_kinks_are() -> None:
+    """They were looked for at sample points, and those of a saturation at seven deviations were not found."""
+    rows = inner_rows(Linearisation.of(followers(), cells=1))[1][0]
+    wanted = np.array([[0.6, -1.2, 0, 0], [0, 0.9, 0.6, -0.9]])
+    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    assert rows.shape[1] == 2
+    assert np.abs(np.abs(np.einsum("kdi,di->kd", rows, wanted)) - 1).max() < 1e-12
+
+
+def test_what_saturates_hardly_ever_costs_no_more_than_what_does_not() -> None:
+    """Boxes of the states reach beyond the kinks that sums of states stay far from."""
+    assert linear_answer(followers().replace(delta=1e-5), cells=1).log10_delta < -5

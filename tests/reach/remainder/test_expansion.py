@@ -307,3 +307,32 @@ def test_boxes_are_cut_no_further_than_their_own_middles_allow(monkeypatch: pyte
     assert np.all(beta.max(axis=0) <= upper[0])
     assert np.all(upper[0] <= beta.max(axis=0) + 0.01 * np.ptp(beta, axis=0) + 1e-12)
     assert np.all(beta.min(axis=0) >= lower[0])
+
+
+@pytest.mark.parametrize("meeting", [False, True])
+def test_constraints_of_other_blocks_cull_no_boxes_of_one(meeting: bool) -> None:
+    """Two saturated loops: boxes of one are 0 in the other, which its constraints may exclude."""
+
+    def flow(x: Array) -> list[object]:
+        first, second = (np.maximum(np.minimum(a + 2 * b, 0.2), -0.2) for a, b in (x[:2], x[2:]))
+        return [x[1], -x[0] - first, x[3] + (first + second if meeting else 0), -x[2] - second]
+
+    system = cb.ContinuousSystem(flow, states=4, diffusion=0.05 * np.eye(4))
+    problem = cb.Problem(system, initial=[0.05, 0, 0.05, 0], safe=[], horizon=0.2, delta=1e-2)
+    engine = Linearisation(problem, pieces=2)
+    model, rng = engine.model, np.random.default_rng(4)
+    normals = np.array([[1, 2, 0, 0], [0, 0, 1, 2]]) / np.sqrt(5)
+    rows = np.broadcast_to(normals, (2, 2, 4))
+    assert np.allclose(np.abs(model.kink_normals(engine.frame)), rows)
+    assert len([block for group in model.blocks for block in group]) == 2
+    assert bool(model.apart) != meeting
+    low, high = (np.broadcast_to(a, (2, 6)) for a in ([-0.3] * 4 + [-0.1, 0.12], [0.4] * 4 + [0.2, 0.3]))
+    lower, upper = model.bound(engine.frame, low, high, rows, 3)
+    s = rng.uniform(-0.3, 0.4, (40_000, 4))
+    along = s @ normals.T
+    s = s[((along >= low[0, 4:]) & (along <= high[0, 4:])).all(axis=1)]
+    for k in range(2):
+        beta = remainder(engine, k, rng.uniform(size=len(s)), s)
+        assert np.all(beta.max(axis=0) <= upper[k] + 1e-12)
+        assert np.all(beta.min(axis=0) >= lower[k] - 1e-12)
+        assert meeting or np.all(upper[k] - lower[k] <= 1.2 * np.ptp(beta, axis=0) + 0.01)

@@ -19,6 +19,8 @@ from certbound.checker.statement import read_model
 from certbound.checker.statement.turned import turned_model
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.model import Tape, compile_numpy, turned_tape
+from certbound.quadratic.setting import make_setting
+from certbound.reach.sets.directions import requirements
 from certbound.safety.answers import EngineAnswer, Request, exact
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.engines import Apart, Turned, in_coordinates, linear_engine
@@ -26,6 +28,7 @@ from certbound.safety.engines.oblique_limits import axes, eased, straight, turns
 from certbound.safety.engines.turning import exact_product, scales_of, turned_problem
 from certbound.safety.verdict import verdict_of
 from experiments.middle import platoon
+from tests.reach.sets.test_directions import still
 
 
 def pair() -> cb.Problem:
@@ -90,6 +93,19 @@ def test_states_of_different_sizes_are_asked_in_units_of_their_own(size: float) 
     assert "multiples of about" in found.reason
     assert found.log10_delta == pytest.approx(of_one_size().log10_delta, rel=0.01)
     assert linear_engine(problem).log10_delta > found.log10_delta + 0.01
+
+
+def test_limits_are_said_in_the_units_of_their_states() -> None:
+    """60 <= G was `8*G >= 60` and `G >= 7.5` where engines had been asked with G in units of 8."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=["G", "I"], diffusion=np.diag([3.0, 1e-5]))
+    safe = [cb.Inside(cb.Box([60.0, -np.inf], [160.0, 1e-3])), cb.Inside(cb.HalfSpace([1.0, 1e4], 1e3))]
+    plain = cb.Problem(system, initial=[100.0, 0.0], safe=safe, horizon=1.0)
+    other = turned_problem(plain, np.diag([0.125, 2.0**14]), np.diag([8.0, 2.0**-14]))
+    setting = make_setting(other, np.array([7.5, -16.0]), np.array([20.0, 2.0**14 * 1e-3]))
+    names = [setting.name_of(wall) for wall in setting.walls if wall.side is not None]
+    assert [name.partition(",")[0] for name in names] == ["G >= 60", "G <= 160", "I >= -0.0009766", "I <= 0.001"]
+    found = [one.label.rpartition("(")[2] for one in requirements(other, still(np.array([12.5, 0.0])))]
+    assert found == ["G <= 160)", "I <= 0.001)", "G >= 60)", "G + 10000*I <= 1000"]
 
 
 def test_states_of_one_size_keep_their_units() -> None:

@@ -31,3 +31,13 @@ def test_a_first_bound_is_what_the_first_walls_say_and_soon(monkeypatch: pytest.
     assert first["target"] == 1.0  # whatever is found, and nothing, is enough
     assert first["seconds"] < 5 < later["seconds"]
     assert later["target"] == 1e-3
+
+
+@pytest.mark.parametrize("obstacle", [cb.Box([0], [1]), cb.HalfSpace([-1.0], 0.0), cb.Box([0], [0]), cb.Ball([1], 1.0)])
+@pytest.mark.parametrize("method", ["constants", "quadratic", "linear", "values"])
+def test_who_starts_on_the_edge_of_an_obstacle_has_failed(obstacle, method: str) -> None:
+    """The first step leads away, and was all that constants and quadratic bounds looked at in discrete time."""
+    system = cb.DiscreteSystem(lambda x: [x[0] - 1], states=1, noise=cb.Gaussian(std=0.05))
+    safe = [cb.Outside(obstacle), cb.Inside(cb.Box([-50], [50]))]
+    problem = cb.Problem(system, initial=[0.0], safe=safe, horizon=1, delta=0.3)
+    assert cb.verify_safety(problem, method=method, time_limit=5).log10_delta == 0

@@ -56,3 +56,16 @@ def test_an_engine_for_sets_bounds_what_simulation_finds_and_no_certificate_says
     assert 10**verdict.log10_delta > cb.simulate_exits(problem, paths=20_000).lower
     with pytest.raises(CertificateError, match="says of a random one"):
         certificate_data(problem, verdict)
+
+
+def test_where_disturbances_leave_no_room_a_random_start_is_told_so() -> None:
+    """It was told of a defect: a random start has no hull that could be split."""
+    system = cb.DiscreteSystem(
+        lambda x, d: [0.5 * abs(x[0]) + d[0]], states=1, disturbance=cb.Box([-0.15], [0.15]),
+        noise=cb.Gaussian(std=0.2),
+    )  # fmt: skip
+    passed = cb.Outside(cb.Box([0.25], [0.75]), during=(2, 2))  # which the noise-free tube touches
+    problem = cb.Problem(system, initial=cb.GaussianStart([-0.1], [[0.01]]), safe=[passed], horizon=2)
+    reason = cb.verify_safety(problem, method="constants").reason
+    assert "already leaves no room" in reason
+    assert "; try a smaller disturbance" in reason

@@ -322,9 +322,9 @@ def test_sizes_of_cells_that_would_leave_too_wide_a_gap_are_left_out() -> None:
     assert shares[0] == 0.33
     assert 0.15 not in shares
     left = [0.33, 0.22, 0.15, 0.1]
-    assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, False, lambda share: True)[0] == 0.15
-    assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, False, lambda share: share > 0.3) == left
-    assert without_hopeless(left, (0.5, 2.8, 0.0), 1.05, False, lambda share: True) == left
+    assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, 2.5, lambda share: True)[0] == 0.15
+    assert without_hopeless(left, (0.5, 2.8, 1.58), 1.05, 2.5, lambda share: share > 0.3) == left
+    assert without_hopeless(left, (0.5, 2.8, 0.0), 1.05, 2.5, lambda share: True) == left
 
 
 def test_boxes_of_long_horizons_cost_in_proportion(monkeypatch: pytest.MonkeyPatch) -> None:

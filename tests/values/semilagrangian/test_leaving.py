@@ -30,12 +30,14 @@ from certbound.watch import OutOfTime, Watch
 COARSE = Plan(count=20, fine=1.0, wide=0.012, cell=0.4, spare=1e-12)
 
 
-def bound_by_steps(setting, plan: Plan, layout=None, *, side: int = 0) -> float:
-    return bounds_by_steps(setting, plan, layouts=layout and [layout] * plan.count)[side]
+def bound_by_steps(setting, plan: Plan) -> float:
+    """The upper bound alone."""
+    return bounds_by_steps(setting, plan, below=False)[0]
 
 
-def bound_by_steps_below(setting, plan: Plan, layout=None) -> float:
-    return bound_by_steps(setting, plan, layout, side=1)
+def both_bounds(setting, plan: Plan) -> tuple[float, float]:
+    """Upper and lower bound, where one layout serves all steps."""
+    return bounds_by_steps(setting, plan, layouts=[next(layouts_of(setting, plan))] * plan.count)
 
 
 def mechanical(force, s: float, low, high, horizon: float, start) -> cb.Problem:
@@ -75,8 +77,7 @@ def simulated(problem: cb.Problem, paths: int, rng: np.random.Generator) -> tupl
 def test_the_bound_is_above_what_simulation_counts_and_near_it(force, s, low, high, start, most) -> None:
     problem = mechanical(force, s, low, high, 1.5, start)
     setting = setting_of(problem)
-    layout = next(layouts_of(setting, COARSE))
-    bound, below = (side(setting, COARSE, layout) for side in (bound_by_steps, bound_by_steps_below))
+    bound, below = both_bounds(setting, COARSE)
     share, error = simulated(problem, 8000, np.random.default_rng(1))
     assert bound >= share - 4 * error
     assert bound <= most * (share + 4 * error)
@@ -93,10 +94,9 @@ def wiener_exit(s: float, horizon: float) -> float:
 def test_at_a_face_of_the_noise_hardly_anything_is_lost_on_either_side() -> None:
     setting = setting_of(mechanical(lambda x: 0.0 * x[0], 0.8, [-2, -1], [2, 1], 0.5, (0.0, 0.0)))
     plan = Plan(count=8, fine=2.0, wide=0.02, cell=0.4, spare=1e-15)
-    layout = next(layouts_of(setting, plan))
-    exact = wiener_exit(0.8, 0.5)
-    assert exact < bound_by_steps(setting, plan, layout) < 1.12 * exact
-    assert exact > bound_by_steps_below(setting, plan, layout) > 0.85 * exact
+    exact, (upper, lower) = wiener_exit(0.8, 0.5), both_bounds(setting, plan)
+    assert exact < upper < 1.12 * exact
+    assert exact > lower > 0.85 * exact
 
 
 def pulled(safe: list[cb.Inside], s: float = 0.8) -> cb.Problem:
@@ -117,8 +117,7 @@ def test_limits_of_other_shapes_are_bounded_from_both_sides(safe, most) -> None:
     problem = pulled(safe)
     setting = setting_of(problem)
     plan = Plan(count=24, fine=1.0, wide=0.01, cell=0.4, spare=1e-15)
-    layout = next(layouts_of(setting, plan))
-    upper, lower = bound_by_steps(setting, plan, layout), bound_by_steps_below(setting, plan, layout)
+    upper, lower = both_bounds(setting, plan)
     rng, d = np.random.default_rng(2), 1.2 / 600
     x, failed = np.tile([0.1, 0.0], (8000, 1)), np.zeros(8000, dtype=bool)
     for _ in range(600):
@@ -388,7 +387,7 @@ def test_on_a_scouted_grid_the_bounds_hold() -> None:
     plan = replace(COARSE, count=15, loss=0.01, cell=0.3)
     seeing = next(layouts_of(setting, plan, leaving.scout_of(setting)))
     share, error = simulated(problem, 3_000, rng)
-    upper, lower = bound_by_steps(setting, plan, seeing), bound_by_steps_below(setting, plan, seeing)
+    upper, lower = bounds_by_steps(setting, plan, layouts=[seeing] * plan.count)
     assert lower - 4 * error < share < upper + 4 * error
     assert lower < upper < 2.5 * lower
 

@@ -393,6 +393,21 @@ def test_values_are_cut_down_to_one_only_where_all_around_is_at_least_one() -> N
     assert [cut.nodal[10, 10], cut.nodal[9, 10], cut.nodal[8, 8], cut.bend[8, 8]] == [0.5, 1.5, 1.0, 0.0]
 
 
+def test_between_lines_a_function_that_is_cut_down_is_no_less_than_one() -> None:
+    """A line that sags below 1 between its nodes was left so beside one that had been cut down."""
+    nodal, bend = np.array([[1.3, 1.3], [1.2, 1.2], [0.5, 0.5]]), np.array([[0.0], [-2.0], [-0.5]])
+    axis = np.arange(3.0)
+    names = ("image", "radius", "slopes", "bends", "drift", "live")
+    frame = Frame(y=axis, q=axis[:2], **dict.fromkeys(names))
+    cut = limited(frame, unbound(nodal.shape, (1, 1)), nodal, bend)
+    assert cut.nodal.tolist() == [[1.0, 1.0], [1.2, 1.2], [0.5, 0.5]]
+    before, middle = (
+        reading(frame, lines, np.array([0.5, 1.5]), np.full(2, 0.5)) for lines in (Lines(nodal=nodal, bend=bend), cut)
+    )
+    assert np.all(middle >= np.minimum(before, 1.0))
+    assert cut.bend.tolist() == [[0.0], [0.0], [-0.5]]
+
+
 def test_which_problems_are_served_and_what_the_others_are_told() -> None:
     assert serves(duffing())
     both = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.1, 0], [0, 0.3]])

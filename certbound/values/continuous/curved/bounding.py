@@ -5,6 +5,7 @@ The way of `two_sides`, with what the region meets of each cell in place of all 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import time
@@ -59,6 +60,8 @@ _STEEP = 1.0  # how far V falls at most over a cell at a wall, at the horizon
 _SAMPLES = (4, 5, 5)
 _SELDOM = math.log(1e-7)  # log P below which U itself is not proposed
 _LEAST, _COST, _MOST = 2.5, 0.0075, 60  # seconds that it takes, about those of a proposal over cells^2, most cells
+_BELOW, _LEAST_BELOW = 0.8, 8.0  # of as many seconds again, for the lower bound; with fewer it has to decide
+_FEWEST_BELOW = 40  # cells without which there hardly is one
 _NEARLY = 0.3  # of log P above a rough guess: then log U is proposed, too
 _RANK = 1e-9  # of the squared noise: a smaller share in some direction everywhere is none
 Squares = Callable[[float, Array, Array], Array]
@@ -67,7 +70,7 @@ _ALIKE = 0.03  # of log P, which a smaller box may add to a rough guess
 
 
 def bound_region(problem: Problem, model: Model, deadline: float, wanted: float, between: Between) -> Found:
-    """The upper bound on one grid after another; both in a box, the lower one where that is above ``wanted``.
+    """The upper bound on one grid after another, and the lower one where that is above ``wanted``.
 
     In a box ``between`` (`straight.bound_between`) is asked first. Certificates know no curved limits.
     """
@@ -78,7 +81,8 @@ def bound_region(problem: Problem, model: Model, deadline: float, wanted: float,
         return upper, lower, words.replace("two states", "two states on a box that few paths leave"), stated
     patches = _RATE * granted
     upper, done = 0.0, list[str]()
-    if plane.autonomous and len(model.branches) == 1 and level > _SELDOM and granted >= _LEAST:
+    served = plane.autonomous and len(model.branches) == 1 and level > _SELDOM
+    if served and granted >= _LEAST:
         from certbound.values.continuous.curved.near_walls import bound_near_walls
 
         cells = min(math.isqrt(int(granted / _COST)), _MOST)
@@ -95,8 +99,17 @@ def bound_region(problem: Problem, model: Model, deadline: float, wanted: float,
                 break
             raise
         done.append(f"{plan.cells}^2")
+    lower = None
+    due = granted >= _LEAST_BELOW or -math.inf < wanted < level
+    if upper > wanted and wanted < math.inf and served and due:
+        from certbound.values.continuous.curved.near_walls_below import bound_near_walls_below
+
+        cells = min(max(math.isqrt(int(_BELOW * granted / _COST)), _FEWEST_BELOW), _MOST)
+        with contextlib.suppress(OutOfTime, InfeasibleError):  # noise that may vanish somewhere
+            lower = bound_near_walls_below(problem, plane, region.walls, model, cells, math.exp(level))
+        done.append(f"{cells}^2 below")
     words = f"value function in two states within curved limits, cells: {', '.join(done)}"
-    return upper, None, words, ([], [])
+    return upper, lower, words, ([], [])
 
 
 def ramps_for(plane: Plane, target: Set, cells: int, upper: bool) -> TargetRamps:

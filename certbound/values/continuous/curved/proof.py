@@ -23,7 +23,7 @@ from certbound.problem.sets import Inside, Region
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Interpolant
 from certbound.values.continuous.curved.boundaries import Wall, Walls
-from certbound.values.continuous.curved.cuts import Cuts
+from certbound.values.continuous.curved.cuts import Cuts, Ends
 from certbound.values.continuous.hypotheses import (
     NEGLIGIBLE,
     Model,
@@ -50,7 +50,7 @@ _ELEVATE = np.array([
 ])  # fmt: skip
 """Bernstein coefficients of degree 5 from those of degree 2, each entry rounded once."""
 _DEEPEST = 7
-_FINER = 16  # parts of a part of a cell, where V on a wall is looked at
+FINER = 16  # parts of a part of a cell, where V on a wall is looked at
 
 
 def raised_over_walls(surface: Surface, cuts: Cuts) -> Surface:
@@ -70,7 +70,7 @@ def least_on_walls(surface: Surface, cuts: Cuts) -> float:
         return np.inf
     least = np.inf
     for first, last in surface.chunks():
-        parts = cuts.parts(surface.patches(first, last).take(_tiled(cuts.cut, surface, last - first)), last - first)
+        parts = cuts.parts(surface.patches(first, last).take(tiled(cuts.cut, surface, last - first)), last - first)
         for wall, mask in cuts.touched:
             place = np.flatnonzero(np.tile(mask, last - first))
             chosen = np.flatnonzero(mask)
@@ -79,32 +79,43 @@ def least_on_walls(surface: Surface, cuts: Cuts) -> float:
     return least
 
 
-def _on_wall(patches: Patches, wall: Wall, ends: tuple[tuple[Interval, Interval], ...], slabs: int) -> Array:
+def _on_wall(patches: Patches, wall: Wall, ends: Ends, slabs: int) -> Array:
     """Lower bounds of V over each patch where g = 0, by parts of it that the wall may meet."""
-    patches, ends = _quartered(patches, ends)
+    patches, ends = quartered(patches, ends)
+    (low, _), (least, most) = leaning(patches, wall, ends, slabs, (-np.inf, np.inf))
+    return np.asarray(np.where((least > 0) | (most < 0), np.inf, low).reshape(-1, FINER).min(axis=1))
+
+
+def leaning(
+    patches: Patches, wall: Wall, ends: Ends, slabs: int, factors: tuple[float, float]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Lower and upper bounds over each patch of V + mu g, and of g; ``ends`` are those of the patches of one slab.
+
+    mu is a polynomial in time whose Bernstein coefficients lie between the ``factors``.
+    """
     found = wall.bernstein(ends)
     table = np.einsum("ai,sij,bj->sab", _ELEVATE, found.mid, _ELEVATE)
     size = np.abs(table).max(axis=(1, 2))
     off = found.rad.max(axis=(1, 2)) + 40 * _UNIT * size
-    missed = (found.lo.min(axis=(1, 2)) > 0) | (found.hi.max(axis=(1, 2)) < 0)
+    sign = np.tile(found.lo.min(axis=(1, 2)), slabs), np.tile(found.hi.max(axis=(1, 2)), slabs)
     table, size, off = (np.tile(part, (slabs, *[1] * (part.ndim - 1))) for part in (table, size, off))
-    factor = _ratio(patches.coefficients, table)
-    moved = patches.coefficients + factor[:, :, None, None] * table[:, None]
+    factor = np.clip(_ratio(patches.coefficients, table), *factors)
+    moved = (patches.coefficients + factor[:, :, None, None] * table[:, None]).reshape(len(factor), -1)
     slack = _UNIT * (1000 * (patches.size + np.abs(patches.reference)) + 10 * np.abs(factor).max(axis=1) * size)
     slack += np.abs(factor).max(axis=1) * off * (1 + 1e-12)
-    low = patches.reference + moved.reshape(len(moved), -1).min(axis=1) - slack
-    return np.asarray(np.where(np.tile(missed, slabs), np.inf, low).reshape(-1, _FINER).min(axis=1))
+    ends_of_v = patches.reference + moved.min(axis=1) - slack, patches.reference + moved.max(axis=1) + slack
+    return ends_of_v, sign
 
 
-def _quartered(
-    patches: Patches, ends: tuple[tuple[Interval, Interval], ...]
-) -> tuple[Patches, tuple[tuple[Interval, Interval], ...]]:
-    """Each patch in `_FINER` equal parts, one after the other; enclosed ends of the parts of one slab."""
+def quartered(
+    patches: Patches, ends: Ends
+) -> tuple[Patches, Ends]:
+    """Each patch in `FINER` equal parts, one after the other; enclosed ends of the parts of one slab."""
     shares = np.arange(5) / 4
     finer = np.einsum("pai,qbj,ktij->kpqtab", QUARTERS, QUARTERS, patches.coefficients, optimize=True)
     coefficients = finer.reshape(-1, *patches.coefficients.shape[1:])
-    widths = tuple(np.repeat(width / 4, _FINER) for width in patches.widths)
-    reference, size, step = (np.repeat(one, _FINER) for one in (patches.reference, patches.size, patches.step))
+    widths = tuple(np.repeat(width / 4, FINER) for width in patches.widths)
+    reference, size, step = (np.repeat(one, FINER) for one in (patches.reference, patches.size, patches.step))
     parts = Patches(coefficients=coefficients, reference=reference, size=size, step=step, widths=widths)
     places = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
     found = []
@@ -149,7 +160,7 @@ def look_over(
     def at(ends: tuple[int, int]) -> list[Found]:
         first, last = ends
         patches, slabs = surface.patches(first, last), last - first
-        whole, cut = (_tiled(cells, surface, slabs) for cells in (cuts.whole, cuts.cut))
+        whole, cut = (tiled(cells, surface, slabs) for cells in (cuts.whole, cuts.cut))
         parts = np.tile(np.arange(len(cuts.cell)), slabs)
         places = [np.tile(cuts.whole, slabs), parts] if fixed else [whole, np.arange(len(parts))]
         both = fixed or _interpolants(surface, cuts, model, first, last, counts)
@@ -171,20 +182,23 @@ def _interpolants(
     return [whole, cuts.interpolants(surface, model, first, last, counts) if len(cuts.cut) else whole]
 
 
-def examine_within(surface: Surface, cuts: Cuts, model: Model, need: Need) -> Proof:
-    """Enclose R from above, V and Q2 on every patch, and part of a cut patch, that needs it."""
-    counts = model.counts()
+def examine_within(
+    surface: Surface, cuts: Cuts, model: Model, need: Need, *, upper: bool = True, straight: bool = False
+) -> Proof:
+    """Enclose R (closely on one side), V and Q2 on every patch, and part of a cut patch, that needs it."""
+    counts = model.counts(straight)
     share = _NEAR * (0.5 + 0.5 * surface.times[-1] / (surface.slabs * surface.steps))
 
     def look(lot: Lot) -> tuple[Ranges, Index, Index] | None:
         low, high = value_range(lot.patches)
-        size = coarse_size(lot.patches, lot.drifts, lot.squares, lot.place)
-        kept = np.flatnonzero(~(low >= need.top) & ~(size <= need.free(high)))  # what is no number is looked at
+        size = np.inf if straight else coarse_size(lot.patches, lot.drifts, lot.squares, lot.place)
+        due = ~(low >= need.top) & ~(high <= need.bottom) & ~(size <= need.free(high))  # no number is looked at, too
+        kept = np.flatnonzero(due)
         if not len(kept):
             return None
         ranges = bound_ranges(
             lot.patches.take(kept), lot.drifts, lot.squares, lot.place[kept], counts, wanted=need.spare,
-            near=share[lot.slab[kept]] * need.free(high[kept]), upper=True,
+            near=share[lot.slab[kept]] * need.free(high[kept]), upper=upper, straight=straight,
         )  # fmt: skip
         return ranges, lot.slab[kept], lot.cell[kept]
 
@@ -196,11 +210,11 @@ def examine_within(surface: Surface, cuts: Cuts, model: Model, need: Need) -> Pr
     none = np.empty(0, dtype=np.intp)
     return Proof(
         ranges=Ranges(**joined), slab=np.concatenate([none, *(slab for _, slab, _ in found)]),
-        cell=np.concatenate([none, *(cell for _, _, cell in found)]),
+        cell=np.concatenate([none, *(cell for _, _, cell in found)]), seen=(surface, need),
     )  # fmt: skip
 
 
-def _tiled(cells: Index, surface: Surface, slabs: int) -> Index:
+def tiled(cells: Index, surface: Surface, slabs: int) -> Index:
     """Where some cells are among the patches of so many slabs."""
     per = int(np.prod(surface.cells))
     return np.asarray((np.arange(slabs)[:, None] * per + cells).ravel())

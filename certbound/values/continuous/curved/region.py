@@ -45,6 +45,19 @@ def _square(constraint: Inside) -> bool:
     return not isinstance(form, Quadratic) and all(np.count_nonzero(row) == 1 for row in form.normals)
 
 
+def limits_around(problem: Problem) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """(low, high) of the limits along the coordinates, rounded inward, and outward; infinite where there is none."""
+    low, high = np.full((2, 2), -np.inf), np.full((2, 2), np.inf)  # inner and outer, for each state
+    for constraint in as_stays(problem.constraints):
+        if not constraint.outside and _square(constraint):
+            for axis, side, *ends in faces_of(constraint):
+                if side == 0:
+                    low[:, axis] = np.maximum(low[:, axis], ends)
+                else:
+                    high[:, axis] = np.minimum(high[:, axis], ends)
+    return (low[0], high[0]), (low[1], high[1])
+
+
 def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) -> Region:
     """The box and the walls; with ``near`` a box that ends not far beyond simulated paths.
 
@@ -56,17 +69,12 @@ def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) ->
     InfeasibleError
         Windows and moving sets.
     """
-    low, high = np.full(2, -np.inf), np.full(2, np.inf)
+    low, high = limits_around(problem)[0]
     around = [np.full(2, -np.inf), np.full(2, np.inf)]
     walls, ends = [], []
     for constraint in as_stays(problem.constraints):
         refuse_windows(constraint, problem)
         if not constraint.outside and _square(constraint):
-            for axis, side, inner, _ in faces_of(constraint):
-                if side == 0:
-                    low[axis] = max(low[axis], inner)
-                else:
-                    high[axis] = min(high[axis], inner)
             continue
         walls.append(constraint)
         own = [-np.asarray(constraint.region.support(-np.eye(2))), np.asarray(constraint.region.support(np.eye(2)))]

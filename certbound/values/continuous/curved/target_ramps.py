@@ -97,8 +97,8 @@ class TargetRamps(WalledRamps):
         nodes = crowded_nodes(self.plane, plan, axis, self.curve, _CROWD)
         return bent(nodes, [*self.ends[axis], *self.plane.starts[axis]])
 
-    def _weakened(self, force: Array, a: Array, places: Sequence[Array]) -> Array:
-        return super()._weakened(force, a, places) if self.arrives else force
+    def _weakened(self, force: Array, a: Array, places: Sequence[Array], faces: Sequence[tuple[bool, bool]]) -> Array:
+        return super()._weakened(force, a, places, faces) if self.arrives else force
 
     def edges(self, value: Array, step: float, fed: Array, ages: Array) -> Array:
         return np.outer(1 - left_at(ages / self.lead), self.on_faces) + self.first[self.edge]

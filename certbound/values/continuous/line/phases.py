@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Graph, Tape, arithmetic
+from certbound.problem.model import JUMPS, Graph, Tape, arithmetic, needed
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 from certbound.rigor.intervals import Interval
@@ -166,7 +166,15 @@ def _gate(limits: list[Limit], t: float, inner: bool) -> Gate:
 
 
 def phase_of(limits: list[Limit], start: float, end: float, cuts: tuple[float, float]) -> Phase:
-    """The phase of some limits of one state; at ``cuts`` where none is on that side."""
+    """The phase of some limits of one state; at ``cuts`` where none is on that side.
+
+    Raises
+    ------
+    InfeasibleError
+        A limit may jump: the coordinates in which it stands still would jump with it, and no path does.
+    """
+    if any(limit.center is not None and _may_jump(limit.center) for limit in limits):
+        raise InfeasibleError("value functions in continuous time need limits that move without jumps.")
     sides = [_strongest([limit for limit in limits if limit.side == side], side) for side in (0, 1)]
     closed = (sides[0] is not None, sides[1] is not None)
     ends = [cut if side is None else side for side, cut in zip(sides, cuts)]
@@ -183,6 +191,12 @@ def phase_of(limits: list[Limit], start: float, end: float, cuts: tuple[float, f
     origin = graph.tape([nodes[0]], (1,))
     width = graph.tape([graph.apply("sub", nodes[1], nodes[0])], (1,))
     return Phase(start=start, end=end, low=0.0, high=1.0, closed=closed, origin=origin, width=width)
+
+
+def _may_jump(center: Tape) -> bool:
+    """Whether operations are used that jump although their slopes are bounded on both sides."""
+    used = needed(center.nodes, center.outputs)
+    return any(kept and node.op in (*JUMPS, "atan2") for kept, node in zip(used, center.nodes))
 
 
 def held_at(phase: Phase, faces: tuple[float | None, float | None]) -> Phase:

@@ -14,20 +14,23 @@ from certbound.values.continuous.plane.solver import Solver, integrated, solve_l
 from certbound.values.continuous.plane.stages import windowed
 from certbound.values.continuous.plane.target_proposal import bent, sides_of
 from certbound.values.continuous.plane.two_sides import (
+    RATE,
     Found,
+    Sketch,
     bound_box,
     bound_plane_above,
     chart_plane,
     confined,
     held_plane,
+    plan_above,
     released,
     rough_level,
     two_states,
 )
 
 __all__ = [
-    "Floats", "Found", "Pair", "Plan", "Plane", "Solver", "Source", "bent", "bound_box", "bound_failing",
-    "bound_moving", "bound_plane_above", "bound_windows", "chart_plane", "confined", "floats_of", "held_plane",
-    "integrated", "led", "moving", "plane_of", "reach_of", "released", "rough_level", "sides_of", "slab_times",
-    "solve_lines", "spread_nodes", "two_states", "windowed",
+    "Floats", "Found", "Pair", "Plan", "Plane", "RATE", "Sketch", "Solver", "Source", "bent", "bound_box",
+    "bound_failing", "bound_moving", "bound_plane_above", "bound_windows", "chart_plane", "confined",
+    "floats_of", "held_plane", "integrated", "led", "moving", "plan_above", "plane_of", "reach_of", "released",
+    "rough_level", "sides_of", "slab_times", "solve_lines", "spread_nodes", "two_states", "windowed",
 ]

@@ -143,7 +143,7 @@ def bound_plane_above(
     upper, done = 0.0, []
     proposed: list[Proposed] = []
     stated = rare == -math.inf and not held_anywhere(plane)  # certificates know of no face that paths do not cross
-    plans = {plan.cells: plan for plan in (_plan(plane, level, share * patches) for share in _SHARES)}
+    plans = {plan.cells: plan for plan in (plan_above(plane, level, share * patches) for share in _SHARES)}
     kinds: list[Propose] = [propose_plane] if held_anywhere(plane) else _several()
     for plan in plans.values():
         try:
@@ -162,7 +162,7 @@ def bound_plane_above(
     return upper, done, proposed
 
 
-def _plan(plane: Plane, level: float, patches: float) -> Plan:
+def plan_above(plane: Plane, level: float, patches: float) -> Plan:
     """The finest grid with about so many patches; slabs grow fewer as fast as cells do.
 
     Where failing is rare (log P the ``level``) a longer lead costs little, and makes for fronts that are less steep.
@@ -207,7 +207,7 @@ def chart_plane(problem: Problem, model: Model, room: Room, levels: list[float],
     plane = plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem))
     least = rough_level(plane)
     levels = sorted({max(level, least) for level in levels})
-    plan = _plan(plane, levels[0], _SHARES[0] * RATE * seconds)
+    plan = plan_above(plane, levels[0], _SHARES[0] * RATE * seconds)
     surface = _promising(plane, model, plan, levels[-1])
     return [] if surface is None else chart_above(surface, model, levels, [0])
 

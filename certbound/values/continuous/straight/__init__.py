@@ -5,6 +5,10 @@
 """
 
 from certbound.values.continuous.straight.near_one import bound_between, bound_plane
-from certbound.values.continuous.straight.ramps import SMALL, Ramps, Solve, left_at, ramp_of, stage_rates
+from certbound.values.continuous.straight.ramps import PAST, SMALL, Ramps, Solve, left_at, ramp_of, stage_rates
+from certbound.values.continuous.straight.relative import relative_below
 
-__all__ = ["SMALL", "Ramps", "Solve", "bound_between", "bound_plane", "left_at", "ramp_of", "stage_rates"]
+__all__ = [
+    "PAST", "SMALL", "Ramps", "Solve", "bound_between", "bound_plane", "left_at", "ramp_of", "relative_below",
+    "stage_rates",
+]

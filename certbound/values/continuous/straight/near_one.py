@@ -31,6 +31,7 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
+from certbound.values.continuous.rare import RAREST, bound_rare
 from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
@@ -53,7 +54,7 @@ _AGAIN = (3.0, 3.0)  # the same for bounds of it
 _GENTLY = (1.12, 1.12, 1.12), (2.0, 2.0, 2.0)  # both where failing is rare
 _FIRST, _ABOVE, _BELOW = 0.5, 0.44, 0.56  # of what may be spent, for logarithms; of the rest, for each bound then
 _RARELY = 0.0035  # about the seconds of one of them, over cells^2
-_FAR = 1.0  # of log P above a rough guess: logarithms may do better
+_FAR, _FARTHER = 1.0, 3.0  # of log P above a rough guess: a finer grid does better, and logarithms may
 _FINE = 34  # cells along each state, without which nothing comes of it
 _LONG = {True: 0.02, False: 0.012}  # a ramp's share of the horizon then: fronts start as wide as cells
 _NEARLY = 0.1  # of log P: what is left to pay is no more
@@ -84,17 +85,26 @@ def bound_plane(
     check_noise(model, (0.0, inner.horizon), list(zip(room.inner_low, room.inner_high)))
     if wanted < math.inf:
         check_noise(model, (0.0, inner.horizon), list(zip(room.outer_low, room.outer_high)))
-    return bound_between(problem, model, inner, outer, deadline, wanted, other, looked=above, guesses=guesses)
+    granted, level = round(deadline - time.perf_counter(), 1), rough_level(inner)
+    if above and level < RAREST:
+        return bound_rare(inner, model, granted, level, wanted, other)
+    return bound_between(
+        problem, model, inner, outer, time.perf_counter() + granted, wanted, other, looked=above, guesses=guesses,
+        level=level,
+    )  # fmt: skip
 
 
 def bound_between(
     problem: Problem, model: Model, inner: Plane, outer: Plane | None, deadline: float, wanted: float, other: Other,
-    *, looked: bool = True, guesses: list[float] | None = None,
+    *, looked: bool = True, guesses: list[float] | None = None, level: float | None = None,
 ) -> Found:
-    """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due."""
+    """Bounds on an inner box (upper) and an outer one (lower, if any), by ``other`` (deadline, wanted) where due.
+
+    ``level`` is about log P, if that is known.
+    """
     granted = round(deadline - time.perf_counter(), 1)
     served = inner.autonomous and len(model.branches) == 1 and granted >= _COST * _FEWEST**2
-    level = rough_level(inner)
+    level = rough_level(inner) if level is None else level
     if not served or not _RARE < level < 0:
         if served and _RAREST < level <= _RARE and granted >= _RARELY * _FINE**2:
             return _with_rare(problem, model, (inner, outer), granted, level, wanted, other, looked, guesses)
@@ -162,6 +172,8 @@ def _with_rare(
         words, granted, room = f"{words}, ", (1 - share) * granted, (1 - share) * room
     shares = (_ABOVE, _BELOW) if room * _ABOVE >= 1 else (1.0, 1.0)
     cells = [round(math.sqrt(share * granted / _RARELY)) for share in shares]
+    if looked and shares[0] == 1:  # with what logarithms would take
+        cells[0] = round(math.sqrt((1 + _FIRST) * granted / _RARELY))
     outer = outer if shares[0] < 1 or not looked else None  # one bound or none
     try:
         if looked:
@@ -172,7 +184,7 @@ def _with_rare(
         if upper > wanted and outer is not None and wanted < math.inf:
             least = rarely(outer, model, cells[1], level, points_of(problem), below=True)
             words += f", {cells[1]}^2 below"
-        done = not looked or upper <= wanted or upper < level + _FAR
+        done = not looked or upper <= wanted or upper < level + (_FARTHER if shares[0] == 1 else _FAR)
         if not done or (least is None and upper > wanted and outer is not None and wanted < math.inf):
             logs = other(time.perf_counter() + _FIRST * granted, wanted)
             least = max((one for one in (least, logs[1]) if one is not None), default=None)

@@ -54,7 +54,7 @@ _LONGEST = 8  # steps of the horizon, at least
 _FINELY, _SLOWLY = 24, 0.2  # both where failing is rare
 _SOONER = 2.0  # ramps that U starts before T then
 _CLOSELY = 0.25  # correlated: a wider box
-_PAST = 0.05  # d: how far beyond 0 and 1 U is where it is given up
+PAST = 0.05  # d: how far beyond 0 and 1 U is where it is given up
 _ZONE = 6  # cells at a face where the drift back is weakened
 
 _R = 6**0.5
@@ -87,7 +87,7 @@ class Ramps:
     ) -> None:
         self.plane, self.lead, self.longest = plane, lead, _FINELY if finely else _LONGEST
         self.small, self.growth = (_SMALLER, _SLOWLY) if finely else (SMALL, _GROWTH)
-        self.shift = _SOONER if finely else self.shift
+        self.shift, self.begun = _SOONER if finely else self.shift, _FIRST
         nodes = [self.grid(axis, Plan(cells=cells, growth=_GROWTH, lead=lead)) for axis in (0, 1)]
         shared = _correlation(plane, nodes)
         wide = [np.pad(one, 1, "reflect", reflect_type="odd") for one in nodes]
@@ -117,7 +117,7 @@ class Ramps:
         self.operator += part((1 - on[0]) * (1 - on[1]) * a[0, 1], 1, 1)
         met = on.sum(axis=0).ravel()
         moves = ((met == 0) | (share.ravel() > 0)).astype(float)  # not on faces that are no limits
-        drawn, lost = -_PAST if below else 1 + _PAST, eased * moves * lost.ravel()
+        drawn, lost = -PAST if below else 1 + PAST, eased * moves * lost.ravel()
         given = (one * np.ones(np.shape(other)) for one, other in zip(plain, (force, led)))
         self.plain = not lost.any() and all(map(np.array_equal, given, (force, led)))
         self.operator = csr_matrix(diags(moves) @ self.operator - diags(lost) @ self.mass)
@@ -139,6 +139,10 @@ class Ramps:
     def least(self, whole: Surface) -> float:
         """A lower bound of U where paths fail."""
         return min(whole.face_range(axis, side)[0] for axis in (0, 1) for side in (0, 1))
+
+    def top(self, whole: Surface) -> float:
+        """An upper bound of U where paths may go: it may rise over 1 beside corners."""
+        return top_of(whole)
 
     def _eased(self, force: Array, a: Array, led: Array, x: Array, y: Array, below: bool) -> tuple[Array, Array]:
         """The drift and what faces count where the drift leads back into the box faster than cells can follow.
@@ -167,7 +171,7 @@ class Ramps:
     def surface(self, source: Source | None, *, below: bool) -> Surface:
         """V = e (U - 1), the source being added to U's equation, or taken off for a lower bound."""
         horizon, shift = self.plane.horizon, 0.0 if below else self.shift * self.lead
-        times, first = _times(horizon, shift, self.lead, (self.longest, self.growth))
+        times, first = _times(horizon, shift, (self.lead, self.begun), (self.longest, self.growth))
         sign = -1.0 if below else 1.0
         given = None if source is None else sign * self.fed(source)
         value = self.first
@@ -243,8 +247,7 @@ class Ramps:
 
     def scaled(self, whole: Surface, below: bool) -> Surface:
         """V = e (U - 1) from U itself."""
-        # U may rise over 1 beside corners
-        scale = self.small / (max(1.0, top_of(whole)) if below else max(self.least(whole), 0.5))
+        scale = self.small / (max(1.0, self.top(whole)) if below else max(self.least(whole), 0.5))
         return replace(
             whole, values=scale * whole.values, start_rates=scale * whole.start_rates, end_rates=scale * whole.end_rates
         ).raised(-self.small)
@@ -288,11 +291,17 @@ def _at(times: Array, values: Array, t: float) -> Array:
     return np.asarray((1 - share) * values[left] + share * values[left + 1]).ravel()
 
 
-def _times(horizon: float, shift: float, lead: float, longest: tuple[int, float]) -> tuple[Array, int]:
-    """Ends of the steps, one of them at ``shift`` and the last one at shift + horizon, and the first one's number."""
-    step, steps = _FIRST * lead, [_FIRST * lead]
+def _times(
+    horizon: float, shift: float, ramp: tuple[float, float], longest: tuple[int, float]
+) -> tuple[Array, int]:
+    """Ends of the steps, one of them at ``shift`` and the last one at shift + horizon, and the first one's number.
+
+    ``ramp`` is its length and the first step's share of it.
+    """
+    first_step = ramp[0] * ramp[1]
+    step, steps = first_step, [first_step]
     while sum(steps) < horizon + shift:
-        while 2 * step <= min(longest[1] * (sum(steps) + 2 * _FIRST * lead), horizon / longest[0]):
+        while 2 * step <= min(longest[1] * (sum(steps) + 2 * first_step), horizon / longest[0]):
             step *= 2
         steps.append(step)
     times = np.concatenate([[0.0], np.cumsum(steps)])

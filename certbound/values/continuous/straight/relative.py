@@ -65,14 +65,15 @@ def seen_below(
     return examine(surface, model, need, upper=False, near=near, straight=True)
 
 
-def relative_below(proof: Proof) -> float | None:
+def relative_below(proof: Proof, highest: float | None = None) -> float | None:
     """A lower bound of log P from what `seen_below` saw of V; None where there is none.
 
-    `Need.bottom` bounds V where paths end without having failed; nothing is asked where V is less.
+    `Need.bottom` bounds V where paths end without having failed; nothing is asked where V is less. ``highest`` bounds
+    V wherever paths may go, on the whole surface if it is not given.
     """
     assert proof.seen is not None
     surface, need = proof.seen
-    highest = max(0.0, top_of(surface))
+    highest = max(0.0, top_of(surface) if highest is None else highest)
     if not highest < 1:
         return None
     more = math.exp(highest) * _UP  # than e^V anywhere
