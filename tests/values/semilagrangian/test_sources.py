@@ -153,7 +153,7 @@ def test_paths_leave_where_the_drift_leads_outward() -> None:
     assert (found.levels()[outside] >= 1).all()
 
 
-def testpayments_cover_what_is_lacking() -> None:
+def test_payments_cover_what_is_lacking() -> None:
     rng = np.random.default_rng(3)
     for _ in range(50):
         low = rng.uniform(-0.1, 1.3, 200) * rng.choice([1, 1e-3], 200)
@@ -214,6 +214,20 @@ def test_both_ends_of_a_step_are_paid(monkeypatch) -> None:
     count = len(calls)
     for last in (count - 1, count):  # the ends of the last step
         assert proved(last) > plain + 0.1 * calls[-1]
+
+
+def test_what_is_less_than_0_at_the_horizon_is_paid(monkeypatch) -> None:
+    found = ground_of(setting(servo, horizon=0.2), 3.0)
+    bounds = found.measure()
+
+    def sunk(*inputs):
+        _, bare, low, high = bounds(*inputs)
+        return np.zeros(low.shape), np.minimum(bare, 0.0), low - 0.3, high
+
+    monkeypatch.setattr(Ground, "measure", lambda self: sunk)
+    paid = march(found, 0.2, 1e3)
+    assert paid.rate == 0
+    assert 0.3 <= paid.amount < 0.4
 
 
 @pytest.mark.slow
