@@ -42,6 +42,6 @@ def _kernel_cache(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempP
 def pytest_runtest_teardown(item: pytest.Item) -> None:
     """What a test computes in balls of its own must not change what the next one sees."""
     flint = sys.modules.get("flint")
-    if flint is not None and flint.ctx.prec != 53:
-        flint.ctx.prec = 53
-        pytest.fail(f"{item.name} leaves flint at another precision; use flint.ctx.workprec.")
+    if flint is not None and (flint.ctx.prec, flint.ctx.cap) != (53, 10):
+        flint.ctx.prec, flint.ctx.cap = 53, 10
+        pytest.fail(f"{item.name} leaves flint at another precision; use flint.ctx.workprec, monkeypatch for cap.")
