@@ -32,8 +32,6 @@ def _curved(engine: Linearisation) -> Array:
     """Extreme eigen-directions of the Hessians in the metric of the deviation's spread."""
     active, cells, blocks = engine.model.active, engine.cells, engine.model.blocks
     count = len(active)
-    if not blocks:
-        return np.zeros((cells, engine.pieces, 0, count))
     rows = _normals(engine)
     if not 2 <= count <= _MOST or len(blocks) != 1 or len(blocks[0]) != 1:
         return rows

@@ -18,6 +18,7 @@ from certbound.reach.remainder.frame import Frame
 from certbound.rigor.intervals import Interval
 
 _ROUNDING = 2e-15  # relative: of a division, and of a step that is a float near the exact one
+Bounds = tuple[Array, Array, Array]
 Parts = Iterator[tuple[Remainder, Frame, Integers, float]]
 
 
@@ -49,8 +50,18 @@ class HeldRemainder:
 
     @property
     def blocks(self) -> list[list[list[int]]]:
-        """None of its own: no further directions are looked for."""
+        """None of its own: no further directions are looked for but those of kinks."""
         return []
+
+    @property
+    def kinked(self) -> bool:
+        """Whether the flow or the law has kinks that boxes are cut at."""
+        return any(model.kinked and not model.planar for model in (self.flow, self.sample))
+
+    @property
+    def planar(self) -> bool:
+        """Whether nothing else bounds either of them but planes."""
+        return not self.kinked
 
     @property
     def entries(self) -> list[tuple[int, int]]:
@@ -76,6 +87,21 @@ class HeldRemainder:
         """Float derivative of the flow by the disturbance; see `Derivatives.reference_gain`."""
         return self.flow.reference_gain(time, state, inputs, disturbance)
 
+    def kink_normals(self, frame: HeldFrame) -> Array:
+        """Normals of the kinks of both, (M, K, active): on pieces of the other kind, as at the piece of the own before.
+
+        On the pieces before the first of its own kind, as there.
+        """
+        found = [np.zeros((len(frame), 0, len(self.active)))]
+        for model, part, places, _ in self._parts(frame):
+            if model.kinked and not model.planar:
+                last = np.searchsorted(places, np.arange(len(frame)), side="right") - 1
+                normals = model.kink_normals(part)[np.maximum(last, 0)]
+                full = np.zeros((*normals.shape[:2], len(self.active)))
+                full[..., self._columns(model)] = normals
+                found.append(full)
+        return np.concatenate(found, axis=1)
+
     def _parts(self, frame: HeldFrame) -> Parts:
         yield self.flow, frame.flow, frame.flowing, 1.0
         yield self.sample, frame.sample, frame.sampling, frame.step
@@ -92,7 +118,7 @@ class HeldRemainder:
             if asked is not None and not len(asked):
                 continue
             hoped = None if target is None else (target[0][places] * scale, target[1][places] * scale)
-            found = model.bound(part, *self._own(model, low, high, places), effort, hoped, asked)
+            found = model.bound(part, *self._own(model, low, high, rows, places), effort, hoped, asked)
             slack = _ROUNDING * np.maximum(np.abs(found[0]), np.abs(found[1])) / scale
             lower[places], upper[places] = found[0] / scale - slack, found[1] / scale + slack
         return lower, upper
@@ -102,7 +128,7 @@ class HeldRemainder:
         lower = np.zeros((len(frame), self.flow.problem.system.dimension))
         upper = lower.copy()
         for model, part, places, scale in self._parts(frame):
-            found = model.sampled(part, *self._own(model, low, high, places))
+            found = model.sampled(part, *self._own(model, low, high, rows, places))
             lower[places], upper[places] = found[0] / scale, found[1] / scale
         return lower, upper
 
@@ -111,7 +137,7 @@ class HeldRemainder:
         n = self.flow.problem.system.dimension
         result = np.zeros((len(frame), n, n))
         for model, part, places, _ in self._parts(frame):
-            result[places] = model.fitted(part, *self._own(model, low, high, places))
+            result[places] = model.fitted(part, *self._own(model, low, high, rows, places))
         return result
 
     def defect(self, frame: HeldFrame) -> Array:
@@ -121,8 +147,13 @@ class HeldRemainder:
             result[places] = model.defect(part) / scale
         return result
 
-    def _own(self, model: Remainder, low: Array, high: Array, places: Integers) -> tuple[Array, Array, Array]:
-        """Bounds along the states that a model is not affine in, and no further rows."""
-        columns = np.searchsorted(self.active, model.active)
-        rows = np.zeros((len(places), 0, len(columns)))
-        return low[places][:, columns], high[places][:, columns], rows
+    def _columns(self, model: Remainder) -> Index:
+        """Where a model's active states stand among all."""
+        return np.searchsorted(self.active, model.active)
+
+    def _own(self, model: Remainder, low: Array, high: Array, rows: Array, places: Integers) -> Bounds:
+        """Bounds along the states that a model is not affine in, and along the rows over these alone."""
+        columns, count, rows = self._columns(model), len(self.active), rows[places]
+        own = np.flatnonzero(~np.delete(rows, columns, axis=2).any(axis=(0, 2)))
+        chosen = np.concatenate([columns, count + own])
+        return low[places][:, chosen], high[places][:, chosen], rows[:, own][..., columns]

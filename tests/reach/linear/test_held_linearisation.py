@@ -10,6 +10,7 @@ import pytest
 import certbound as cb
 from certbound.problem.held import held_loop
 from certbound.reach.linear import HeldLinearisation
+from certbound.reach.linear.rows import inner_rows
 
 
 def scalar(hold: float, *, a: float = 0.5, gain: float = 1.5, **changes: object) -> cb.Problem:
@@ -98,6 +99,46 @@ def test_remainders_of_law_and_flow_hold_at_random_points() -> None:
             beta = np.array([np.sin(x[1]), np.tan(x[2]), 0.0]) - velocity - slopes[k] @ shift
             assert np.all(low[k] <= beta + 1e-9)
             assert np.all(beta - 1e-9 <= high[k])
+
+
+def saturated(**changes: object) -> cb.Problem:
+    """A mass that is pushed back by at most 1.6, and is now and then pushed by so much."""
+    system = cb.ContinuousSystem(
+        lambda x, v, u: [v, u - 0.5 * v], states=["x", "v"], inputs=cb.Box([-1.6], [1.6]), diffusion=[[0.0], [0.25]]
+    )
+    given: dict[str, object] = {
+        "initial": [0.1, 0.0], "safe": [cb.Inside(cb.Box([-0.6, -np.inf], [0.6, np.inf]))], "horizon": 2, "hold": 0.1,
+        "plan": lambda x, v: np.clip(-6 * x - 3 * v, -1.6, 1.6), "delta": 1e-3,
+    }
+    return cb.Problem(system, **(given | changes))
+
+
+@pytest.mark.slow
+def test_a_law_that_saturates_along_a_sum_of_states_is_bounded_along_it() -> None:
+    verdict = cb.verify_safety(saturated(), method="linear")
+    assert verdict.status == "SAFE"
+
+
+def test_remainders_of_a_law_hold_where_rows_cut_what_saturates() -> None:
+    engine = HeldLinearisation(held_loop(saturated(plan=lambda x, v: np.clip(-6 * x - 6 * v, -1.6, 1.6))))
+    extra = inner_rows(engine)[1][0]
+    assert extra.shape == (engine.pieces, 1, 2)
+    assert extra == pytest.approx(np.full(extra.shape, extra[0, 0, 0]))  # of the flow's pieces as well
+    reach = np.concatenate([np.full((engine.pieces, 2), 0.4), np.full((engine.pieces, 1), 0.2)], axis=1)
+    low, high = engine.model.bound(engine.frame, -reach, reach, extra)
+    whole = engine.model.bound(engine.frame, -reach[:, :2], reach[:, :2], extra[:, :0])
+    rng, inside = np.random.default_rng(0), 0
+    for i, k in enumerate(engine.sampling):
+        shift = np.concatenate([rng.uniform(-0.4, 0.4, (400, 2)), np.zeros((400, 1))], axis=1)
+        shift = shift[np.abs(shift[:, :2] @ extra[k, 0]) <= 0.2]
+        x = engine.nodes[0, k] + shift
+        law = np.clip(-6 * x[:, 0] - 6 * x[:, 1], -1.6, 1.6)
+        beta = (law - engine.nodes[0, k + 1, 2] - shift @ engine.jumps[0, i, 2]) / engine.step
+        assert low[k, 2] - 1e-9 <= beta.min()
+        assert beta.max() <= high[k, 2] + 1e-9
+        inside += len(beta)
+    assert inside > 1000
+    assert (high - low)[engine.sampling, 2].sum() < 0.5 * (whole[1] - whole[0])[engine.sampling, 2].sum()
 
 
 def test_every_cell_of_a_set_of_starts_is_bounded() -> None:
