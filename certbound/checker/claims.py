@@ -145,8 +145,6 @@ def _plain_parts(
     """
     if model.stays and not _is_whole(model, proof) and not (model.members or model.drawn):
         raise CertificateError(f"`{path}.engine` must be \"values\" where a target is to be stayed in.")
-    if model.hold is not None and model.target is not None:
-        raise CertificateError("`problem.hold` must be left out beside a target.")
     if model.members:
         for one, row, place in _members(model, proof, path):
             yield from _plain_parts(one, row, place)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
+
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.errors import CertboundError
+from certbound.errors import CertboundError, EngineError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Outside
 from certbound.reach.nominal import Flow
@@ -26,8 +29,12 @@ def best_time(problem: Problem) -> float:
     """The time of the target's window at which the worst of a few noise-free trajectories is deepest in it.
 
     In floating point: whatever it is, to meet the target then is one way of not failing. Without an end the time of
-    `arrival`, where there is one.
+    `arrival`, where there is one; where inputs are held a sampling time, as if they followed at once.
+
+    EngineError where inputs are held, and are not computed within the window.
     """
+    if problem.hold is not None:
+        return _at_sample(problem)
     if problem.endless:
         last, stay = arrival(problem)
         return last if stay else _deepest(_until(problem, last), _NEARLY)
@@ -35,6 +42,22 @@ def best_time(problem: Problem) -> float:
     if first == last or (isinstance(problem.plan, np.ndarray) and problem.system.time == "continuous"):
         return last
     return _deepest(problem, 0.0)
+
+
+def _at_sample(problem: Problem) -> float:
+    """The sampling time at which trajectories under inputs that follow at once are deepest in the target."""
+    step, (first, last) = Fraction(repr(problem.hold)), (Fraction(repr(end)) for end in window_of(problem))
+    samples = [number * step for number in range(max(1, math.ceil(first / step)), math.floor(last / step) + 1)]
+    found = [float(time) for time in samples if Fraction(repr(float(time))) == time]
+    if not found:
+        raise EngineError(
+            f"the target counts from {float(first):g} to {float(last):g}, when no inputs are computed, which are held "
+            f"for {problem.hold:g}; let its `during` hold a multiple of that."
+        )
+    times, _, _, paths, flow = _followed(problem.replace(hold=None))
+    depth = rooms(Inside(problem.reach.region, (0.0, times[-1])), flow, times, paths).min(axis=0)
+    depth = np.interp(found, times, np.where(np.isfinite(depth), depth, -np.finfo(float).max))
+    return found[int(np.argmax(depth))]
 
 
 def _deepest(problem: Problem, less: float) -> float:

@@ -4,13 +4,14 @@ import contextlib
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.cli.commands.check import proved_certificate
 from certbound.errors import CertificateError, InfeasibleError
 from certbound.problem.goals import met_at, until
-from certbound.safety.certificate import problem_data
+from certbound.safety.certificate import certificate_data, problem_data
 
 WALL, TARGET = cb.Inside(cb.Box([-1.0], [1.0])), cb.Box([-0.2], [0.2])
 
@@ -228,3 +229,29 @@ def test_a_random_walk_may_arrive_where_no_noise_free_path_does(delta: float, st
     safe, target = [cb.Inside(cb.Box([-6], [6]))], cb.Reach(cb.Box([2.0], [6.0]))
     problem = cb.Problem(walk, initial=[0.0], safe=safe, reach=target, horizon=100, delta=delta)
     assert cb.verify_safety(problem).status == status
+
+
+def held(during) -> cb.Problem:
+    system = cb.ContinuousSystem(lambda x, u: 0.5 * x + u, states=["x"], inputs=cb.Box([-9], [9]), diffusion=[[0.4]])
+    return cb.Problem(
+        system, initial=[1.0], safe=[cb.Inside(cb.Box([-9], [9]))], reach=cb.Reach(cb.Box([-0.8], [0.8]), during=during),
+        horizon=2, hold=0.5, delta=0.5, plan=lambda x: -1.5 * x,
+    )
+
+
+def test_where_inputs_are_held_a_target_is_met_at_a_sampling_time():
+    mean, variance = 1.0, 0.0
+    for _ in range(4):
+        factor = np.exp(0.25) - 3 * np.expm1(0.25)
+        mean, variance = factor * mean, factor**2 * variance + 0.16 * np.expm1(0.5)
+    truth = norm.sf((0.8 - mean) / variance**0.5) + norm.cdf((-0.8 - mean) / variance**0.5)
+    at_end = cb.verify_safety(held((2, 2)))
+    assert truth <= 10**at_end.log10_delta <= 1.5 * truth
+    data = certificate_data(held((2, 2)), at_end)
+    assert check_data(data, problem_data(held((2, 2)))).valid
+    data["proof"]["time"], data["problem"]["reach"]["during"] = (1.75).hex(), None
+    with pytest.raises(CertificateError, match=r"`proof.time` must be a sampling time"):
+        check_data(data)
+    between = cb.verify_safety(held((1.1, 1.4)))
+    assert between.status == "UNKNOWN"
+    assert "let its `during` hold a multiple of that" in between.reason

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 
 from flint import arb, arb_mat
 
@@ -330,9 +331,10 @@ def met_at(model: Model, time: float) -> Model:
 
     It is one way of not failing. Constraints that begin later are dropped, the others end with that time.
 
-    CertificateError where the time is none of the window, or the plan is an array over a longer time.
+    CertificateError where the time is none of the window, the plan is an array over a longer time, or inputs that are
+    held are not computed then.
     """
-    target = model.target
+    target, hold = model.target, model.hold
     assert target is not None
     first, last = target.during or (0.0, model.horizon)
     if not (first <= time <= last and time > 0) or (not model.continuous and time != int(time)):
@@ -342,6 +344,11 @@ def met_at(model: Model, time: float) -> Model:
         if model.continuous:
             raise CertificateError("`proof.time` must be the horizon where the plan is an array.")
         plan = plan[: int(time)]
+    if hold is not None:
+        samples = hold.count * Fraction(repr(time)) / Fraction(repr(model.horizon))
+        if samples.denominator != 1:
+            raise CertificateError("`proof.time` must be a sampling time where inputs are held.")
+        hold = replace(hold, count=int(samples))
     kept = []
     for constraint in model.constraints:
         begin, end = constraint.during or (0.0, model.horizon)
@@ -350,7 +357,8 @@ def met_at(model: Model, time: float) -> Model:
             kept.append(replace(constraint, during=None if whole else (begin, min(end, time))))
     due = replace(target, during=(time, time))
     number = len(kept) if model.domain is None else len(kept) - 1  # the domain stands last
-    return replace(model, horizon=time, plan=plan, target=None, constraints=(*kept[:number], due, *kept[number:]))
+    constraints = (*kept[:number], due, *kept[number:])
+    return replace(model, horizon=time, plan=plan, hold=hold, target=None, constraints=constraints)
 
 
 def _starts(value: object, path: str, n: int, budget: Budget) -> tuple[Initial, tuple[Initial, ...]]:
