@@ -234,7 +234,8 @@ def test_a_random_walk_may_arrive_where_no_noise_free_path_does(delta: float, st
 def held(during) -> cb.Problem:
     system = cb.ContinuousSystem(lambda x, u: 0.5 * x + u, states=["x"], inputs=cb.Box([-9], [9]), diffusion=[[0.4]])
     return cb.Problem(
-        system, initial=[1.0], safe=[cb.Inside(cb.Box([-9], [9]))], reach=cb.Reach(cb.Box([-0.8], [0.8]), during=during),
+        system, initial=[1.0], safe=[cb.Inside(cb.Box([-9], [9]))],
+        reach=cb.Reach(cb.Box([-0.8], [0.8]), during=during),
         horizon=2, hold=0.5, delta=0.5, plan=lambda x: -1.5 * x,
     )
 
