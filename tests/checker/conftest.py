@@ -6,6 +6,7 @@ import copy
 import json
 import math
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -23,16 +24,29 @@ from certbound.checker.values import step_back
 from certbound.quadratic import bound_quadratic
 from certbound.quadratic.refinement import Search
 from certbound.quadratic.wall_attempts import SPLIT, log10_up, total
+from certbound.reach.linear import linearisation
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.certificates import linear
 from certbound.safety.verification import verify_safety
 from certbound.values.continuous import bound_exits
 from certbound.values.continuous.line import ladder
 
 
+@contextmanager
+def coarsely() -> Iterator[None]:
+    """Linear responses of fewer pieces of time than usual, for short certificates: what is proved of each is the same.
+
+    Those of full length are proved again in tests/safety/test_certificate.py.
+    """
+    with patch.object(linearisation, "FEWEST_PIECES", 20), patch.object(linear, "_FEWEST", 16):
+        yield
+
+
 class Case:
     """A problem, its certificate as data, and its problem part."""
 
+    @coarsely()
     def __init__(self, build: Callable[[], cb.Problem], method: str) -> None:
         self.problem, self.verdict = proved(build, method)
         self.text = certificate_text(self.problem, self.verdict)
@@ -236,8 +250,8 @@ def drifting() -> cb.Problem:
 
 @pytest.fixture(autouse=True)
 def precise() -> Iterator[None]:
-    """The working precision of a check."""
-    with ctx.workprec(128):
+    """The working precision of a check, of certificates that are short."""
+    with ctx.workprec(128), coarsely():
         yield
 
 
