@@ -6,7 +6,7 @@ import copy
 import json
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -25,6 +25,7 @@ from certbound.quadratic import bound_quadratic
 from certbound.quadratic.refinement import Search
 from certbound.quadratic.wall_attempts import SPLIT, log10_up, total
 from certbound.reach.linear import linearisation
+from certbound.reach.linear.held import held_linearisation
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
 from certbound.safety.certificates import linear
@@ -39,7 +40,10 @@ def coarsely() -> Iterator[None]:
 
     Those of full length are proved again in tests/safety/test_certificate.py.
     """
-    with patch.object(linearisation, "FEWEST_PIECES", 20), patch.object(linear, "_FEWEST", 16):
+    fewer = (linearisation, "FEWEST_PIECES", 20), (held_linearisation, "_FEWEST", 50), (linear, "_FEWEST", 16)
+    with ExitStack() as patches:
+        for change in fewer:
+            patches.enter_context(patch.object(*change))
         yield
 
 
