@@ -105,7 +105,7 @@ def contraction() -> cb.Problem:
     def rate(x: Any, d: Any) -> Any:
         return [-x[0] - np.tanh(x[0]) + 0.1 * d[0], -1.5 * x[1] + 0.5 * x[0]]
 
-    system = cb.ContinuousSystem(rate, states=2, disturbance=cb.Box([-1], [1]), diffusion=0.1 * np.eye(2))
+    system = cb.ContinuousSystem(rate, states=2, disturbance=cb.Box([-1], [1]), diffusion=0.15 * np.eye(2))
     safe = [cb.Inside(cb.Ball([0, 0], 1.3)), cb.Outside(cb.Ball([1.5, 1.5], 0.4))]
     return cb.Problem(system, initial=cb.Box([0.1, 0.1], [0.2, 0.2]), safe=safe, horizon=1.0, delta=1e-2)
 
@@ -176,7 +176,7 @@ def leaving() -> cb.Problem:
 @cache
 def _exits(build: Callable[[], cb.Problem]) -> tuple[cb.Problem, Any]:
     problem = build()
-    with patch.object(ladder, "LADDER", ((2.5, 1e-3, 0.03),)):
+    with patch.object(ladder, "LADDER", ((1.5, 1e-3, 0.03),)):
         return problem, bound_exits(problem, seconds=0.1)
 
 
