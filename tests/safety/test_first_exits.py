@@ -16,6 +16,7 @@ from certbound.values.continuous.hypotheses import chart_below
 from certbound.values.continuous.line import ladder, maps
 from certbound.watch import OutOfTime
 
+
 def brownian(horizon=2.0, drift=0.0, start=0.0):
     system = cb.ContinuousSystem(lambda x: 0 * x + drift, states=["x"], diffusion=[[1.0]])
     safe = [cb.Inside(cb.Box([-1.0], [1.0]))]
