@@ -136,7 +136,7 @@ def test_a_certificate_states_cells_and_a_forged_one_is_refused():
     text = certificate_text(problem, verdict)
     report = check_data(parse(text), json.loads(json.dumps(problem_data(problem))))
     assert report.valid, report.reason
-    assert report.log10_proved < np.log10(0.01)
+    assert verdict.log10_delta < report.log10_proved < np.log10(0.01)
     lost, wider, other = parse(text), parse(text), parse(text)
     lost["proof"]["cells"].pop()
     assert not check_data(lost).valid
