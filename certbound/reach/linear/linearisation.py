@@ -11,7 +11,7 @@ import numpy as np
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response import LinearResponse, balanced, continuous_response, discrete_response
-from certbound.problem.model import Tape, compile_numpy
+from certbound.problem.model import Tape, compile_numpy, compile_scalar
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear.inclusion import Gathering, Supports, gathering_of
@@ -127,7 +127,11 @@ class Linearisation:
         return np.asarray(np.arange(self.pieces + 1) * self.step, dtype=float)
 
     def _evaluate(self, k: int, time: float, state: Array) -> Array:
-        return self._compiled(time, *state.T, *self.inputs[k], *self.d_middle)
+        """f at one time: what `_compiled` gives, without its care for shapes."""
+        run, slopes = compile_scalar(self.problem.closed_loop), np.empty(state.shape)
+        for place, value in enumerate(run(np.float64(time), *state.T, *self.inputs[k], *self.d_middle)):
+            slopes[:, place] = value
+        return slopes
 
     @cached_property
     def _compiled(self) -> Callable[..., Array]:
