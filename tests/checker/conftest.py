@@ -6,7 +6,7 @@ import copy
 import json
 import math
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -253,9 +253,10 @@ def drifting() -> cb.Problem:
 
 
 @pytest.fixture(autouse=True)
-def precise() -> Iterator[None]:
-    """The working precision of a check, of certificates that are short."""
-    with ctx.workprec(128), coarsely():
+def precise(request: pytest.FixtureRequest) -> Iterator[None]:
+    """The working precision of a check, of certificates that are short (those of slow tests are as usual)."""
+    usual = request.node.get_closest_marker("slow") is not None
+    with ctx.workprec(128), nullcontext() if usual else coarsely():
         yield
 
 
