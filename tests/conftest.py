@@ -2,7 +2,8 @@
 
 What is imported and collected stays to the end: the garbage collector does not walk it again and again (that took a
 sixth of the time). The workers have one thread of linear algebra each, and keep the memory that NumPy gives back
-instead of asking the system for fresh pages (a twentieth of the time).
+instead of asking the system for fresh pages (a twentieth of the time). They write bytecode, as .ci/run lets them: else
+each of them, and each program that a test starts, compiles the whole package anew (half a second each).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ for _name, _value in (
     *((f"MALLOC_{name}_", str(1 << 30)) for name in ("TRIM_THRESHOLD", "MMAP_THRESHOLD")),
 ):
     os.environ.setdefault(_name, _value)  # read when a worker starts
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 @pytest.hookimpl(trylast=True)

@@ -13,7 +13,6 @@ from certbound.plotting.panels import draw_panel
 from certbound.plotting.picture import tightest
 from certbound.plotting.plane import draw_plane, outlines, plane_of
 from certbound.plotting.scene import BLUE, INK, Scene
-from certbound.simulation.estimates import sample_paths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,6 +70,8 @@ def animate(
 
 
 def _scene(verdict: Verdict, paths: int, rng: np.random.Generator) -> Scene:
+    from certbound.simulation.estimates import sample_paths  # loads numba, which pictures that stand still do without
+
     still = Scene.of(verdict)
     try:
         found = sample_paths(still.problem, paths=paths, rng=rng)

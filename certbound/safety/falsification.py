@@ -12,7 +12,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import CertboundError
-from certbound.problem.model import compile_numpy, edged, varying_outputs
+from certbound.problem.model import compile_numpy, compile_scalar, edged, varying_outputs
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Outside, clearance
 from certbound.reach.nominal import Flow
@@ -106,15 +106,22 @@ def follow(flow: Flow, starts: Array, signals: Array) -> tuple[Array, Array]:
             for k in range(steps):
                 paths[:, k + 1] = x = x @ advance.T + pushes[:, k]
             return times, paths
-        function, pushed = compile_numpy(flow.tape), signals.T
+        run, pushed = compile_scalar(flow.tape), signals.T  # it takes columns of numbers as well
+
+        def function(t: float, x: Array, row: Array) -> Array:
+            slopes = np.empty(x.shape)
+            for place, value in enumerate(run(np.float64(t), *x.T, *row, *pushed)):
+                slopes[:, place] = value
+            return slopes
+
         for k in range(steps):
             poll()
             t, h, row = float(times[k]), float(times[k + 1] - times[k]), rows[k]
-            k1 = function(t, *x.T, *row, *pushed)
+            k1 = function(t, x, row)
             if flow.continuous:
-                k2 = function(t + h / 2, *(x + h / 2 * k1).T, *row, *pushed)
-                k3 = function(t + h / 2, *(x + h / 2 * k2).T, *row, *pushed)
-                k4 = function(t + h, *(x + h * k3).T, *row, *pushed)
+                k2 = function(t + h / 2, x + h / 2 * k1, row)
+                k3 = function(t + h / 2, x + h / 2 * k2, row)
+                k4 = function(t + h, x + h * k3, row)
                 x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             else:
                 x = k1

@@ -6,6 +6,7 @@ import copy
 import json
 import math
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -23,16 +24,33 @@ from certbound.checker.values import step_back
 from certbound.quadratic import bound_quadratic
 from certbound.quadratic.refinement import Search
 from certbound.quadratic.wall_attempts import SPLIT, log10_up, total
+from certbound.reach.linear import linearisation
+from certbound.reach.linear.held import held_linearisation
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import certificate_text, problem_data
+from certbound.safety.certificates import linear
 from certbound.safety.verification import verify_safety
 from certbound.values.continuous import bound_exits
 from certbound.values.continuous.line import ladder
 
 
+@contextmanager
+def coarsely() -> Iterator[None]:
+    """Linear responses of fewer pieces of time than usual, for short certificates: what is proved of each is the same.
+
+    Those of full length are proved again in tests/safety/test_certificate.py.
+    """
+    fewer = (linearisation, "FEWEST_PIECES", 20), (held_linearisation, "_FEWEST", 50), (linear, "_FEWEST", 16)
+    with ExitStack() as patches:
+        for change in fewer:
+            patches.enter_context(patch.object(*change))
+        yield
+
+
 class Case:
     """A problem, its certificate as data, and its problem part."""
 
+    @coarsely()
     def __init__(self, build: Callable[[], cb.Problem], method: str) -> None:
         self.problem, self.verdict = proved(build, method)
         self.text = certificate_text(self.problem, self.verdict)
@@ -87,7 +105,7 @@ def contraction() -> cb.Problem:
     def rate(x: Any, d: Any) -> Any:
         return [-x[0] - np.tanh(x[0]) + 0.1 * d[0], -1.5 * x[1] + 0.5 * x[0]]
 
-    system = cb.ContinuousSystem(rate, states=2, disturbance=cb.Box([-1], [1]), diffusion=0.1 * np.eye(2))
+    system = cb.ContinuousSystem(rate, states=2, disturbance=cb.Box([-1], [1]), diffusion=0.15 * np.eye(2))
     safe = [cb.Inside(cb.Ball([0, 0], 1.3)), cb.Outside(cb.Ball([1.5, 1.5], 0.4))]
     return cb.Problem(system, initial=cb.Box([0.1, 0.1], [0.2, 0.2]), safe=safe, horizon=1.0, delta=1e-2)
 
@@ -158,7 +176,7 @@ def leaving() -> cb.Problem:
 @cache
 def _exits(build: Callable[[], cb.Problem]) -> tuple[cb.Problem, Any]:
     problem = build()
-    with patch.object(ladder, "LADDER", ((2.5, 1e-3, 0.03),)):
+    with patch.object(ladder, "LADDER", ((1.5, 1e-3, 0.03),)):
         return problem, bound_exits(problem, seconds=0.1)
 
 
@@ -235,9 +253,10 @@ def drifting() -> cb.Problem:
 
 
 @pytest.fixture(autouse=True)
-def precise() -> Iterator[None]:
-    """The working precision of a check."""
-    with ctx.workprec(128):
+def precise(request: pytest.FixtureRequest) -> Iterator[None]:
+    """The working precision of a check, of certificates that are short (those of slow tests are as usual)."""
+    usual = request.node.get_closest_marker("slow") is not None
+    with ctx.workprec(128), nullcontext() if usual else coarsely():
         yield
 
 

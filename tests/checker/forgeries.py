@@ -141,7 +141,7 @@ def _drawn() -> cb.Problem:
     )
     law = {"gain": cb.Random(law=cb.Uniform(halfwidth=0.2), mean=0.6)}
     return cb.Problem(
-        system, initial=[0.3], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=4, delta=0.008, random=law
+        system, initial=[0.3], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2, delta=0.0035, random=law
     )
 
 
@@ -375,7 +375,8 @@ def _(data: Data) -> None:
 
 @forges("the nominal curve does not jump", "flow", "linear/proof.py", "_Cell", "curve jumps")
 def _(data: Data) -> None:
-    for piece in _cell(data)["nominal"][25:]:
+    pieces = _cell(data)["nominal"]
+    for piece in pieces[len(pieces) // 2 :]:
         for point in piece:
             point[0] = exact(float.fromhex(point[0]) + 1e-9)
 
@@ -495,7 +496,7 @@ def _(data: Data) -> None:
 
 @forges("a level costs what Z exceeds it, in windows", "flow", "linear/events.py", "Windows.exceedance", BEYOND)
 def _(data: Data) -> None:
-    _scale(_cell(data)["levels"], 20, 0.3)
+    _scale(_cell(data)["levels"], 8, 0.3)
 
 
 @forges("levels of the martingale's coordinates cost", "flow", "linear/events.py", "Windows.coordinates", BEYOND)
@@ -572,7 +573,7 @@ def _stopped(data: Data) -> Data:
     "to stay in the set",
 )
 def _(data: Data) -> None:
-    _scale(_stopped(data)["high"], 20, 0.5)
+    _scale(_stopped(data)["high"], 10, 0.5)
 
 
 @forges(

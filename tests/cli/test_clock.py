@@ -100,7 +100,7 @@ def test_constants_fall_back_to_the_quick_ones(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slowed(monkeypatch, "certbound.constants.bounds", "bound_constants", lambda o: "metric" not in o)
-    code, found = answer(capsys, "derive", "ou", "--time-limit", "0.7")
+    code, found = answer(capsys, "derive", "ou", "--time-limit", "0.4")
     assert code == 0
     assert found["rate"] == -0.5
     assert found["metrics"] == []
@@ -110,7 +110,7 @@ def test_tubes_that_were_computed_are_compared(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slowed(monkeypatch, "certbound.tubes.tuning", "tune_tube", lambda o: o["method"] == "prop1")
-    code, found = answer(capsys, "tune", "ou", "--time-limit", "1.2")
+    code, found = answer(capsys, "tune", "ou", "--time-limit", "0.6")
     assert code == 0
     assert found["method"] in {row["method"] for row in found["rows"]}
     assert "prop1" not in {row["method"] for row in found["rows"]}
@@ -150,7 +150,7 @@ def test_no_paths_in_time_is_a_failure_and_some_are_an_answer(
     assert run([*words[:-1], "10"]) == 0  # compiles
     capsys.readouterr()
     slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda options: options["paths"] > 2000)
-    assert answer(capsys, *words, "--time-limit", "0.7")[1]["paths"] == 2000
+    assert answer(capsys, *words, "--time-limit", "0.4")[1]["paths"] == 2000
     slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda _: True)
     assert run([*words, "--time-limit", "0.1"]) == 3
     assert "no paths were simulated within 0.1 s" in capsys.readouterr().err
@@ -193,7 +193,7 @@ def test_as_many_paths_are_simulated_as_fit(
     assert run([*words, "--paths", "10"]) == 0  # compiles
     capsys.readouterr()
     started = time.perf_counter()
-    code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "0.6")
+    code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "0.3")
     assert code == 0
     assert 2000 < found["paths"] < 1e12 == found["asked"]
     assert time.perf_counter() - started < 15

@@ -21,7 +21,7 @@ def test_the_linear_response_reaches_every_bundled_horizon_without_noise(name: s
 def test_the_tube_is_not_much_wider_than_the_sampled_hull_and_a_narrower_one_is_caught() -> None:
     problem = cb.load("pendulum").replace(horizon=2.0)
     reach = cb.bound_reach(problem, noise=False)
-    found = compare(problem, reach, 3000)
+    found = compare(problem, reach, 1500)
     assert found.outside == 0
     assert 1.0 <= found.mean_ratio < 1.1
     assert reach.box is not None

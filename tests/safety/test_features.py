@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Any
 from unittest.mock import patch
 
@@ -23,7 +24,9 @@ from certbound.safety.answers import exact
 from certbound.safety.certificate import problem_data
 from certbound.simulation.estimates.statistics import bound_binomial
 from certbound.values.continuous.line import ladder
-from tests.checker.conftest import side_of
+from tests.checker.conftest import coarsely, kept_tables, side_of
+
+__all__ = ["kept_tables"]  # a fixture
 
 PATHS = 4000
 STEPS = 200
@@ -135,7 +138,7 @@ def _paths(problem: cb.Problem, start: np.ndarray, rng: np.random.Generator) -> 
         pushes.append(np.full(count, high) if one is None else one.mean + _drawn(one.law, count, rng)[:, 0])
         assert one is not None or low < high
     discrete = system.time == "discrete"
-    end = min(problem.horizon, 2500 if discrete else 5)
+    end = min(problem.horizon, (1000 if problem.endless else 2500) if discrete else 5)
     steps = int(end) if discrete else STEPS
     h = 1.0 if discrete else end / steps
     move = compile_numpy(system.dynamics if problem.hold else problem.closed_loop)
@@ -214,6 +217,7 @@ def hold_moments(problem: cb.Problem, rng: np.random.Generator, count: int = 20_
 # ---- the table -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("kept_tables")
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in ROWS])
 def test_a_feature_is_saved_bounded_simulated_and_certified(name: str, tmp_path: Any) -> None:
     path = tmp_path / "problem.toml"
@@ -223,7 +227,7 @@ def test_a_feature_is_saved_bounded_simulated_and_certified(name: str, tmp_path:
     data = problem_data(problem)
     assert problem_data(cb.load(tmp_path / "again.toml")) == data
     hold_moments(problem, np.random.default_rng(11))
-    with patch.object(ladder, "LADDER", ((1.5, 1e-2, 0.1),)):
+    with patch.object(ladder, "LADDER", ((1.5, 1e-2, 0.1),)), nullcontext() if name in SLOW else coarsely():
         verdict = cb.verify_safety(problem, method=METHODS.get(name, OWN[problem.system.time]))
     assert verdict.status == "SAFE"
     rng, first = np.random.default_rng(7), problem.starts[0]

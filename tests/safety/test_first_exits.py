@@ -36,7 +36,8 @@ def found():
     """From the one horizon alone, without those for short times."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(first_exits, "_SHORTEST", 1)
-        patch.setattr(first_exits, "_STEP", 0.01)
+        patch.setattr(first_exits, "_STEP", 0.04)
+        patch.setattr(ladder, "LADDER", ladder.LADDER[:1] * 3)
         return cb.bound_exit_times(brownian())
 
 
@@ -75,7 +76,7 @@ def test_leaving_through_a_cut_is_no_failure_whatever_is_proposed(monkeypatch):
     monkeypatch.setattr(maps, "chart_below", lambda *args: asked.append(args) or chart_below(*args))
     monkeypatch.setattr(first_exits, "_SHORTEST", 1)
     monkeypatch.setattr(first_exits, "_STEP", 0.04)
-    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[:1] * 3)
+    monkeypatch.setattr(ladder, "LADDER", ((1.5, 1e-3, 0.03),) * 3)
     cb.bound_exit_times(brownian(1.0))
     assert asked[0][-1] == [(False, False)]
     plain, cut = (chart_below(*asked[0][:-1], [(False, side)])[0] for side in (False, True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -12,7 +13,14 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data
 from certbound.safety.certificate import problem_data
+from tests.checker.conftest import coarsely
 from tests.networks import random_layers
+
+
+@pytest.fixture(autouse=True)
+def short() -> Iterator[None]:
+    with coarsely():
+        yield
 
 
 def problem_of(rows: Any, time: str = "discrete") -> cb.Problem:

@@ -59,7 +59,7 @@ def van_der_pol() -> cb.Problem:
     system = cb.ContinuousSystem(
         lambda x: [-x[1], x[0] + (x[0] ** 2 - 1) * x[1]], states=2, diffusion=0.3 * np.eye(2)
     )
-    return cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1.2, -1.2], [1.2, 1.2]))], horizon=5)
+    return cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1.2, -1.2], [1.2, 1.2]))], horizon=2)
 
 
 def across_the_cut() -> cb.Problem:

@@ -55,7 +55,7 @@ def swirl() -> Problem:
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Proposals of one state that cost a tenth."""
-    monkeypatch.setattr(ladder, "LADDER", ((2.5, 1e-3, 0.03), (2.5, 1e-3, 0.03)))
+    monkeypatch.setattr(ladder, "LADDER", ((1.5, 1e-3, 0.03), (1.5, 1e-3, 0.03)))
 
 
 def starts_of(problem: Problem, **options: bool) -> SafeStarts:

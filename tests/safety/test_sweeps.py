@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,13 @@ def shrinking(sigma: float = 0.1, radius: float = 1.0, gain: float = 0.5) -> cb.
 def untimed(found: cb.Sweep) -> list[tuple[Any, ...]]:
     """The points but for their seconds."""
     return [(dict(row.parameters), row.status, row.log10_delta, row.log10_lower, row.method) for row in found.points]
+
+
+@pytest.fixture
+def quick() -> Iterator[dict[str, Any]]:
+    """Proved by a thread of this process: for what has nothing to do with copies of it, a tenth of a second each."""
+    with ThreadPoolExecutor(1) as pool:
+        yield {"method": "linear", "executor": pool}
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +79,10 @@ def test_a_table_has_a_line_a_point_and_its_seconds_last(whole: cb.Sweep, tmp_pa
     assert whole.to_dict()["rows"][0]["parameters"] == {"sigma": 0.05, "horizon": 1.0}
 
 
-def test_the_boundary_is_that_of_the_whole_grid_for_fewer_proofs() -> None:
+def test_the_boundary_is_that_of_the_whole_grid_for_fewer_proofs(quick: dict[str, Any]) -> None:
     sigmas = np.linspace(0.05, 0.6, 12)
-    every = cb.sweep(shrinking, {"sigma": sigmas}, **SHORT)
-    found = cb.sweep(shrinking, {"sigma": sigmas}, boundary="sigma", **SHORT)
+    every = cb.sweep(shrinking, {"sigma": sigmas}, **quick)
+    found = cb.sweep(shrinking, {"sigma": sigmas}, boundary="sigma", **quick)
     assert found.boundaries is not None
     (end,) = found.boundaries
     assert end.safe == max(row.parameters["sigma"] for row in every.points if row.status == "SAFE")
@@ -84,9 +92,9 @@ def test_the_boundary_is_that_of_the_whole_grid_for_fewer_proofs() -> None:
     assert found.table().splitlines()[1] == f"{end.safe},{end.not_safe},{end.log10_delta}"
 
 
-def test_a_boundary_may_lie_the_other_way_or_nowhere() -> None:
+def test_a_boundary_may_lie_the_other_way_or_nowhere(quick: dict[str, Any]) -> None:
     over = {"sigma": [0.01, 0.1, 3.0], "radius": [0.1, 0.2, 0.4, 0.8, 1.6]}
-    found = cb.sweep(shrinking, over, boundary="radius", **SHORT).boundaries
+    found = cb.sweep(shrinking, over, boundary="radius", **quick).boundaries
     assert found is not None
     everywhere, smallest, nowhere = found
     assert (everywhere.safe, everywhere.not_safe) == (1.6, None)
@@ -101,26 +109,28 @@ def test_a_boundary_may_lie_the_other_way_or_nowhere() -> None:
 # ---- going on --------------------------------------------------------------------------------------------------
 
 
-def test_a_run_goes_on_where_it_was(whole: cb.Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_goes_on_where_it_was(
+    whole: cb.Sweep, quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file, over = tmp_path / "r.jsonl", {"sigma": SIGMAS, "horizon": [1, 2]}
-    first = cb.sweep(shrinking, over, resume=file, **SHORT)
+    first = cb.sweep(shrinking, over, resume=file, **quick)
     lines = file.read_bytes().splitlines(keepends=True)
     assert len(lines) == 9
     file.write_bytes(b"".join(lines[:5]) + lines[5][:20])  # killed while it wrote
-    second = cb.sweep(shrinking, over, resume=file, **SHORT)
+    second = cb.sweep(shrinking, over, resume=file, **quick)
     assert [row.seconds for row in second.points[:4]] == [row.seconds for row in first.points[:4]]
     assert untimed(second) == untimed(whole)
     assert len(file.read_bytes().splitlines()) == 9
     monkeypatch.setattr(running, "_proved", lambda problem, settings: 1 / 0)  # nothing is left to prove
-    assert untimed(cb.sweep(shrinking, over, resume=file, **SHORT)) == untimed(whole)
+    assert untimed(cb.sweep(shrinking, over, resume=file, **quick)) == untimed(whole)
     file.write_bytes(lines[0][:30])
     monkeypatch.undo()
-    assert untimed(cb.sweep(shrinking, over, resume=file, **SHORT)) == untimed(whole)
+    assert untimed(cb.sweep(shrinking, over, resume=file, **quick)) == untimed(whole)
 
 
-def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_a_file_of_something_else_is_refused_and_left_alone(quick: dict[str, Any], tmp_path: Path) -> None:
     file, over = tmp_path / "r.jsonl", {"sigma": [0.1, 0.2]}
-    cb.sweep(shrinking, over, resume=file, **SHORT)
+    cb.sweep(shrinking, over, resume=file, **quick)
     kept = file.read_bytes()
     cases: list[tuple[Any, dict[str, Any], dict[str, Any], str]] = [
         (shrinking, {"sigma": [0.1, 0.3]}, {}, "belongs to another grid"),
@@ -129,19 +139,19 @@ def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path: Path) -> N
     ]
     for source, grid, more, words in cases:
         with pytest.raises(ValueError, match=words):
-            cb.sweep(source, grid, resume=file, **SHORT, **more)
+            cb.sweep(source, grid, resume=file, **quick, **more)
     assert file.read_bytes() == kept
     damaged = tmp_path / "d.jsonl"
     damaged.write_bytes(kept.replace(b'"status"', b'"stat"', 1))
     with pytest.raises(ValueError, match="damaged in line 2"):
-        cb.sweep(shrinking, over, resume=damaged, **SHORT)
+        cb.sweep(shrinking, over, resume=damaged, **quick)
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match="was not written by a sweep"):
-        cb.sweep(shrinking, over, resume=other, **SHORT)
+        cb.sweep(shrinking, over, resume=other, **quick)
 
 
-def test_a_killed_run_goes_on_with_the_same_table(tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_with_the_same_table(quick: dict[str, Any], tmp_path: Path) -> None:
     file, over = tmp_path / "r.jsonl", {"sigma": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]}
     script = (
         f"import sys, certbound as cb\ncb.sweep('ou', {over}, method='linear', jobs=2, resume=sys.argv[1])"
@@ -154,9 +164,9 @@ def test_a_killed_run_goes_on_with_the_same_table(tmp_path: Path) -> None:
     process.wait()
     kept = file.read_bytes().count(b"\n") - 1
     assert 2 <= kept < 6
-    found = cb.sweep("ou", over, method="linear", jobs=1, resume=file)
+    found = cb.sweep("ou", over, resume=file, **quick)
     assert len(found.points) == 6
-    assert untimed(found) == untimed(cb.sweep("ou", over, method="linear", jobs=1))
+    assert untimed(found) == untimed(cb.sweep("ou", over, **quick))
 
 
 def test_a_lost_process_is_replaced(whole: cb.Sweep) -> None:
@@ -229,12 +239,12 @@ def test_what_is_no_sweep_is_refused(source: Any, over: Any, more: dict[str, Any
         cb.sweep(source, over, **more)
 
 
-def test_pictures_show_curves_maps_and_boundaries(whole: cb.Sweep) -> None:
+def test_pictures_show_curves_maps_and_boundaries(whole: cb.Sweep, quick: dict[str, Any]) -> None:
     from certbound.plotting import draw_sweep
 
     figure = draw_sweep(whole)
     assert [axes.get_xlabel() for axes in figure.axes[:1]] == ["sigma"]
-    line = cb.sweep(shrinking, {"sigma": SIGMAS}, **SHORT)
+    line = cb.sweep(shrinking, {"sigma": SIGMAS}, **quick)
     assert draw_sweep(line).axes[0].get_yscale() == "log"
-    end = cb.sweep(shrinking, {"sigma": SIGMAS, "horizon": [1, 2]}, boundary="sigma", **SHORT)
+    end = cb.sweep(shrinking, {"sigma": SIGMAS, "horizon": [1, 2]}, boundary="sigma", **quick)
     assert draw_sweep(end).axes[0].get_ylabel() == "sigma at the boundary"

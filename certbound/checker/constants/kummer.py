@@ -174,13 +174,13 @@ def partial_excess(data: Kummer, z: arb) -> arb:
 
 def _terms(data: Kummer, z: arb, start: int, first: arb) -> arb:
     """Lower bound of the sum of terms from number ``start`` on, the first of which is given."""
-    a, b = data.a, data.half
+    a, b, little = data.a, data.half, arb(2) ** -60
     total = term = first
     for k in range(start, start + _TERMS):
         term = term * z / ((b + k) * (k + 1))
         term = term * a if data.bessel else term * (a + k)
         total += term
-        if term < total * arb(2) ** -60:
+        if term < total * little:
             break
     return total.lower()
 

@@ -17,7 +17,7 @@ tail.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -35,10 +35,12 @@ _TINY = 1e-290
 _TURN = 0.1  # ||J|| times the length of a window
 _MOST_WINDOWS = 150
 _MOST_ENTRIES = 6_000_000  # of the transition matrices from every node to every window's end
+_MOST_KEPT = 2_000_000  # of the rows that are not computed again
 _HALVINGS = 48
 _SPLITS = (10.0, 3.0)  # how far the log probability granted to M lies below that of Z
 
 
+@lru_cache(maxsize=1024)  # events share their probabilities
 def quantile(log_probability: float) -> float:
     """A level q with log Q(q) <= ``log_probability``, nearly the least."""
     if log_probability >= -0.7:  # Q(0) = 1/2
@@ -73,9 +75,8 @@ class Martingales:
         The squared size along a chord is convex, so that its integral over a piece is at most that of its ends.
         """
         f = self.frame
-        rows = np.einsum("wi,wkij->wkj", directions, f.basis)
+        rows, loss = f.rows(directions)
         late, early = rows[:, 1:], rows[:, :-1]
-        loss = f.loss(directions, late)
         ends = [self._squares(late, np.zeros_like(loss)), self._squares(early, loss)]
         main = f.step / 2 * (np.where(f.inside, ends[0] + ends[1], 0.0)).sum(axis=1)
         bulge = np.einsum("wki,kij,kjm->wkm", np.abs(late), f.bulge, self.size)
@@ -178,6 +179,18 @@ class Windowed:
             later = self.inside[:, j]
             self.basis[later, j] = self.basis[later, j + 1] @ self.transition[j]
         self.magnitude = np.abs(self.basis)
+        self._known: dict[bytes, tuple[Array, Array]] = {}
+
+    def rows(self, directions: Array) -> tuple[Array, Array]:
+        """The float rows rho = directions . basis (W, N + 1, n) and their `loss`; others ask for the same."""
+        key = directions.tobytes()
+        if key in self._known:
+            return self._known[key]
+        rows = np.einsum("wi,wkij->wkj", directions, self.basis)
+        found = rows, self.loss(directions, rows[:, 1:])
+        if (len(self._known) + 1) * rows.size <= _MOST_KEPT:
+            self._known[key] = found
+        return found
 
     def loss(self, directions: Array, late: Array) -> Array:
         """Entrywise bound of |rho_{k+1} F - rho_k| for the float rows rho = directions . basis: (W, N, n)."""

@@ -11,7 +11,7 @@ import numpy as np
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response import LinearResponse, balanced, continuous_response, discrete_response
-from certbound.problem.model import Tape, compile_numpy
+from certbound.problem.model import Tape, compile_numpy, compile_scalar
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear.inclusion import Gathering, Supports, gathering_of
@@ -127,7 +127,10 @@ class Linearisation:
         return np.asarray(np.arange(self.pieces + 1) * self.step, dtype=float)
 
     def _evaluate(self, k: int, time: float, state: Array) -> Array:
-        return self._compiled(time, *state.T, *self.inputs[k], *self.d_middle)
+        run, slopes = compile_scalar(self.problem.closed_loop), np.empty(state.shape)
+        for place, value in enumerate(run(np.float64(time), *state.T, *self.inputs[k], *self.d_middle)):
+            slopes[:, place] = value
+        return slopes
 
     @cached_property
     def _compiled(self) -> Callable[..., Array]:
@@ -141,8 +144,7 @@ class Linearisation:
     @cached_property
     def _followed(self) -> Array:
         """The nominal states, finite or not."""
-        x = np.array(self.centres)
-        states = [x]
+        states = [x := np.array(self.centres)]
         with np.errstate(all="ignore"):
             for k in range(self.pieces):
                 poll("nominal trajectory")
@@ -159,18 +161,16 @@ class Linearisation:
             with np.errstate(over="ignore"):
                 while last > 0 and sizes[last] > 100 * (1 + sizes[last - 1]):  # finite, but no longer meant
                     last -= 1
-            end = last * self.step
             raise EngineError(
-                f"the noise-free trajectory is lost after t = {end:.4g}, before the horizon {self.problem.horizon:g}; "
-                "shorten the horizon, or check the model there."
+                f"the noise-free trajectory is lost after t = {last * self.step:.4g}, before the horizon "
+                f"{self.problem.horizon:g}; shorten the horizon, or check the model there."
             )
         return nodes
 
     def _advance(self, k: int, x: Array) -> Array:
         """Two steps of the classical Runge-Kutta method."""
         h = self.step / 2
-        for half in range(2):
-            t = self.times[k] + half * h
+        for t in (self.times[k], self.times[k] + h):
             k1 = self._evaluate(k, t, x)
             k2 = self._evaluate(k, t + h / 2, x + h / 2 * k1)
             k3 = self._evaluate(k, t + h / 2, x + h / 2 * k2)

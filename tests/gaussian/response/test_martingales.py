@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
-from certbound.gaussian.response.martingales import MartingaleEvent, Martingales, quantile
+from certbound.gaussian.response.martingales import MartingaleEvent, Martingales, Windowed, quantile
 from certbound.rigor.intervals import Interval
 
 Array = NDArray[np.float64]
@@ -91,6 +91,17 @@ def test_what_rows_lose_by_rounding_is_no_more_than_is_said() -> None:
         assert lost <= said[w, k, j]
         missed += lost > 0
     assert missed
+
+
+def test_rows_are_computed_once_for_all_martingales_of_a_frame() -> None:
+    frame = Windowed(response(np.array([[0.0, 1.0], [-1.0, -0.5]]), 1.0, 50), 0)
+    first, second = (np.broadcast_to(row, (len(frame.ends), 2)) for row in ([1.0, 0.0], [0.3, -0.8]))
+    found = frame.rows(first)
+    assert frame.rows(first.copy()) is found
+    for directions in (second, first):
+        rows, loss = frame.rows(directions)
+        assert np.array_equal(rows, np.einsum("wi,wkij->wkj", directions, frame.basis))
+        assert np.array_equal(loss, frame.loss(directions, rows[:, 1:]))
 
 
 def test_without_excess_nothing_is_exceeded() -> None:

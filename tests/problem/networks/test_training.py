@@ -13,7 +13,7 @@ from experiments.networks.training import TASKS, train, write
 
 @pytest.mark.parametrize("task", sorted(TASKS))
 def test_a_policy_imitates_its_law_and_the_seed_says_which(task: str) -> None:
-    options = {"width": 8, "activation": "tanh", "steps": 1500}
+    options = {"width": 8, "activation": "tanh", "steps": 800}
     rows, again = train(TASKS[task], **options), train(TASKS[task], **options)
     np.testing.assert_array_equal(rows[1]["weights"], again[1]["weights"])
     points = np.random.default_rng(1).uniform(TASKS[task].low, TASKS[task].high, (200, len(TASKS[task].low)))

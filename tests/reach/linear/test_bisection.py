@@ -17,7 +17,7 @@ from certbound.watch import OutOfTime
 def flattening(reach: float = 0.9, std: float = 0.02, delta: float = 1e-3) -> cb.Problem:
     system = cb.DiscreteSystem(lambda x: 1.3 * x - 0.6 * x**3, states=1, noise=cb.Gaussian(std=std))
     safe = [cb.Inside(cb.Box([-1.05], [1.05]))]
-    return cb.Problem(system, initial=cb.Box([-reach], [reach]), safe=safe, horizon=6, delta=delta)
+    return cb.Problem(system, initial=cb.Box([-reach], [reach]), safe=safe, horizon=4, delta=delta)
 
 
 def beside(width: float) -> cb.Problem:
@@ -71,7 +71,7 @@ def test_the_tubes_of_all_cells_are_joined(split: SplitAnswer) -> None:
         assert np.all(tube.half_widths >= part.tube.half_widths)
         assert tube.log10_delta >= part.tube.log10_delta
     x = np.linspace(-0.9, 0.9, 41)
-    for step in range(7):
+    for step in range(5):
         assert all(reach.contains(float(step), [value]) for value in x)
         x = 1.3 * x - 0.6 * x**3
     assert np.all(split.extent_along([1.0]) >= split.parts[0].extent_along([1.0]))

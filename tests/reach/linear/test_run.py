@@ -54,7 +54,7 @@ def test_symmetric_constraints_multiply(steps: int) -> None:
 def test_a_wide_initial_set_is_split_until_the_remainder_holds() -> None:
     system = cb.ContinuousSystem(lambda x: -x - x**3, states=1, diffusion=[[0.05]])
     safe = [cb.Inside(cb.Box([-2.0], [2.0]))]
-    problem = cb.Problem(system, initial=cb.Box([-1.6], [1.6]), safe=safe, horizon=2.0, delta=1e-3)
+    problem = cb.Problem(system, initial=cb.Box([-1.6], [1.6]), safe=safe, horizon=1.0, delta=1e-3)
     found = linear_answer(problem)
     assert len(found.engine.centres) > 1
     assert found.log10_delta <= -3
@@ -204,7 +204,7 @@ def test_a_direction_alone_needs_a_proof() -> None:
 
 @pytest.mark.parametrize("effort", [0, 1, 2])
 def test_bounds_of_the_remainder_prove_themselves(effort: int) -> None:
-    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=1.0)))
+    run = LinearRun(Linearisation.of(cb.load("unicycle").replace(horizon=0.5)))
     levels, _ = run.levels(Share.of(1e-4))
     bounds = run.include(levels, effort)
     assert bounds is not None

@@ -46,7 +46,7 @@ def pulse(limit):
 
 
 def test_a_jump_in_time_inside_a_piece_is_seen():
-    assert cb.simulate_exits(pulse(0.1), paths=2000, steps=16_000).probability > 0.9
+    assert cb.simulate_exits(pulse(0.1), paths=200, steps=16_000).probability > 0.9
     assert cb.verify_safety(pulse(0.1), method="linear").status != "SAFE"
     with pytest.raises(ArithmeticError, match="jump"):
         cb.bound_reach(pulse(1.0), noise=False, method="linear")

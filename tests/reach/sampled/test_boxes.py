@@ -80,7 +80,7 @@ def test_the_guarantee_is_kept_as_often_as_it_says() -> None:
     problem = cb.Problem(system, initial=cb.Box([0], [1]), safe=safe, horizon=1.0)
     rng = np.random.default_rng(3)
     outside = []
-    for _ in range(100):
+    for _ in range(60):
         hull = estimate_reach(problem, epsilon=0.2, confidence=0.8, pieces=1, rng=rng).hull
         outside.append(1 - (hull.hi[0, 0] - hull.lo[0, 0]))
     broken = np.mean(np.array(outside) > 0.2)
