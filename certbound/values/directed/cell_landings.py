@@ -112,7 +112,7 @@ def landing_of(work: Directed, t: int, grid: Grid, lines: Array, mesh: Array) ->
     far = _between(lines, (low - away[0])[rough], (high + away[0])[rough])
     narrow = np.minimum.reduceat(np.append(widths, np.inf), _even(strip))[::2] if len(low) else np.zeros(0)
     return Landing(
-        y=y, m=m, live=live, away=(away[0], away[1]), ends=(low - away[0], high + away[0]),
+        y=y, m=m, live=live, away=(away[0], away[1]), ends=_around(low, high, away[0]),
         moves=(moves[0], moves[1]), lines=_rectangles(strip[0], strip[1] + 1, across, count),
         strips=_rectangles(*strip, across, count),
         crossed=_rectangles(line, line, (across[0][cell], across[1][cell]), count),
@@ -146,6 +146,12 @@ def _images(work: Directed, t: int, grid: Grid, mesh: Array) -> tuple[Array, Arr
             strays = near + (width[:, row, 0] * sides[0] + width[:, row, 1] * sides[1]) / 4
         away.append(np.where(known, strays, 0.0) * _ROUND + (work.slip * _ROUND if row == 0 else 0.0))
     return middle[:, 0], np.clip(middle[:, 1], mesh[0], mesh[-1]), away, known & np.isfinite(away[0] + away[1])
+
+
+def _around(low: Array, high: Array, away: Array) -> tuple[Array, Array]:
+    """Ends of y, rounded outward where they are not exact: a place beside a limit is safe or has failed."""
+    first, last = np.nextafter(low - away, -np.inf), np.nextafter(high + away, np.inf)
+    return np.where(away == 0, low, first), np.where(away == 0, high, last)
 
 
 def _between(places: Array, low: Array, high: Array) -> tuple[Index, Index]:

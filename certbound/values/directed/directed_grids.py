@@ -1,7 +1,14 @@
-"""Grids for functions on lines: lines close to each other where paths may leave, nodes a share of the noise apart."""
+"""Grids for functions on lines: lines close to each other where paths may leave, nodes a share of the noise apart.
+
+Of no consequence but for the bounds. Cells across which functions jump (a limit of p is met there, now or a step later)
+are dear: their corners are 1, and where the jump goes through the grid in uneven steps the means have kinks that every
+cell around pays for. So lines go through the places where the jump meets nodes: that took three quarters off what
+was lost by a pendulum's symplectic step.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -18,10 +25,11 @@ PLANS = (
     (6.0, 0.03), (8.0, 0.02), (10.0, 0.015),
 )  # fmt: skip
 """Nodes along q to a standard deviation of the noise, and lines' largest distance in units of how far paths spread."""
-_CLOSER = 3.0  # the lines at limits than nodes along q, in units of what these move y by in a step
 _WIDEN = 0.12  # of the distance from a limit, the lines' distance there
 _BEYOND, _DEVIATIONS = 5.0, 1.0  # of how far paths spread, and of the noise: where the grid ends if no limit is there
 _SLIVER = 1e-3
+_INWARD = 1e-12  # by which lines lie inside of a limit, for rounding
+_GAP = 10  # lines between the places where paths meet two limits, or else one lattice serves both
 _LEAST, _MOST = 60, 2000  # lines over the grid, at least, and nodes along an axis, at most
 _SAMPLES = 9
 
@@ -99,29 +107,82 @@ class Layout:
             If it has too many nodes along q.
         """
         count, apart = plan
-        length = self.y[1] - self.y[0]
+        length, width = self.y[1] - self.y[0], self.work.noise / count
         widest = min(max(apart * float(self.spread[0]), length / _MOST), length / _LEAST)
-        finest = min(max(self.push / (_CLOSER * count), widest / 100), widest)
-        places = np.unique(np.concatenate([np.linspace(*self.y, 2001), *self._around(finest)]))
-        away = np.full(len(places), math.inf)
-        for first, last in [*self.near, *((mark, mark) for mark in self.marks[0])]:
-            away = np.minimum(away, np.maximum(np.maximum(first - places, places - last), 0.0))
-        widths = np.clip(_WIDEN * away, finest, widest)
-        width = self.work.noise / count
         if (self.q[1] - self.q[0]) / width > _MOST:
             raise InfeasibleError("value functions on lines would need too many nodes: the noise is small.")
-        lines = graded_axis(*self.y, places, widths, self.marks[0])
+        if self.work.shear and self.near:
+            return self._oblique(width, widest)
         nodes = graded_axis(*self.q, np.array(self.q), np.array([width, width]), self.marks[1])
+        nodes = nodes if len(nodes) > 3 else np.linspace(*self.q, 5)
+        lines = self._filled(self._met(nodes, widest), max(self.push / count, widest / 100), widest)
         if len(lines) > 2 * _MOST:
             raise InfeasibleError("value functions on lines would need too many of these.")
-        return Grid(axes=(lines, nodes if len(nodes) > 3 else np.linspace(*self.q, 5)))
+        return Grid(axes=(lines, nodes))
 
-    def _around(self, finest: float) -> list[Array]:
-        """Places beside limits, closer and closer, for lengths that are linear in between."""
-        steps = finest * 1.3 ** np.arange(40)
+    def _met(self, nodes: Array, widest: float) -> Array:
+        """The ends, and lines from which a step leads to a limit of p just where q is at a node, in floats.
+
+        Paths leave from beyond a curve: where lines met it anywhere between nodes, it would have uneven steps.
+        """
+        middle, found = (self.y[0] + self.y[1]) / 2, [np.array(self.y)]
+        model, rows = compile_numpy(self.work.tape), self.work.problem.input_sequence
+        inputs = [] if rows is None else list(rows[0])
+        for sign, limit in ((-1.0, self.y[0]), (1.0, self.y[1])):
+            if limit not in (self.low[0], self.high[0]):
+                continue
+            near, far = np.full(len(nodes), limit), np.full(len(nodes), middle)
+            with np.errstate(all="ignore"):
+                ends = [np.broadcast_to(model(0.0, y, nodes, *inputs), (len(nodes), 2))[:, 0] for y in (near, far)]
+                usable = (sign * (ends[0] - limit) > 0) & (sign * (ends[1] - limit) < 0)
+                for _ in range(60):
+                    half = (near + far) / 2
+                    over = sign * (np.broadcast_to(model(0.0, half, nodes, *inputs), (len(nodes), 2))[:, 0] - limit) > 0
+                    near, far = np.where(over, half, near), np.where(over, far, half)
+            places, last = [], limit
+            for place in sorted(far[usable] - sign * _INWARD * (1 + abs(limit)), key=lambda y: abs(y - limit)):
+                if abs(place - last) >= min(_WIDEN * abs(place - limit), widest) + _INWARD:
+                    places.append(place)
+                    last = place
+            found.append(np.array(places))
+        lines = np.unique(np.concatenate(found))
+        return lines[np.concatenate([[True], np.diff(lines[:-1]) > widest / 1000, [True]])]
+
+    def _filled(self, lines: Array, finest: float, widest: float) -> Array:
+        """More lines between those that are farther apart than wanted, but for the closest ones."""
+        marks, found = [], [lines]
+        for mark in self.marks[0]:
+            if np.abs(lines - mark).min() > finest / 10:
+                marks.append(mark)
         ends = [end for pair in self.near for end in pair] + self.marks[0]
-        found = [np.concatenate([end - steps, [end], end + steps]) for end in ends]
-        return [part[(part > self.y[0]) & (part < self.y[1])] for part in found]
+        lines = np.union1d(lines, marks)
+        for a, b in itertools.pairwise(lines):
+            places = np.linspace(a, b, 257)
+            away = np.min([np.abs(places - end) for end in ends], axis=0) if ends else np.full(257, math.inf)
+            wanted = np.minimum(np.maximum(_WIDEN * away, finest), max(widest, finest))
+            if b - a > 1.5 * wanted.max():
+                found.append(graded_axis(a, b, places, wanted))
+        return np.unique(np.concatenate([lines, *found]))
+
+    def _oblique(self, width: float, widest: float) -> Grid:
+        """Lines that meet the limits of p at nodes, for the same reason."""
+        shear, (low, high) = abs(self.work.shear), (self.low[0], self.high[0])
+        inward = _INWARD * (1 + abs(self.y[0]) + abs(self.y[1]))
+        if len(self.near) == 2 and self.near[0][1] + _GAP * shear * width > self.near[1][0]:
+            width = (high - low - 2 * inward) / (shear * math.ceil((high - low) / (shear * width)))
+        nodes = self.q[0] + width * np.arange(math.floor((self.q[1] - self.q[0]) / width) + 1)
+        turned, parts = self.work.shear * nodes, [np.array(self.y)]
+        if np.isfinite(low):
+            parts.append(low - turned + inward)
+        if np.isfinite(high):
+            parts.append(high - turned - inward)
+        lines = np.sort(np.concatenate(parts))
+        lines = lines[np.concatenate([[True], np.diff(lines) > 0.3 * shear * width])]
+        inner = nodes[(nodes > self.q[0] + 0.3 * width) & (nodes < self.q[1] - 0.3 * width)]
+        axes = self._filled(lines, shear * width, widest), np.concatenate([[self.q[0]], inner, [self.q[1]]])
+        if max(map(len, axes)) > 2 * _MOST:
+            raise InfeasibleError("value functions on lines would need too many of these.")
+        return Grid(axes=axes)
 
     def start_grid(self, grid: Grid) -> Grid:
         """A grid over the starts whose cells are about as small as those of ``grid`` there."""

@@ -5,7 +5,7 @@ nodes) and w normal with standard deviation s, everything follows from c(z) = E 
     B_j = [c(z_{j-1}) - c(z_j)]/d_{j-1} - [c(z_j) - c(z_{j+1})]/d_j,   z_j = (q_j - m)/s,  d_j = (q_{j+1} - q_j)/s,
 the same with E (z - w/s)^+, which is taken where z_j < 0. Both are c(|z|) and a straight line, and c(|z|) comes from
 Taylor's formula of degree 7 about the centres of cells of width 1/32, whose coefficients are rounded from balls: its
-remainder is at most 15 phi(0) (1/64)^8/8! < 1e-18. With z known up to 6u |z| (the division, and s itself), c(|z|) is
+remainder is at most 15 phi(0) (1/64)^8/8! < 1e-18. With z known up to 11u |z| (the division, and s itself), c(|z|) is
 off by at most 2e-15 phi(z) + 1e-18, since |z| Q <= phi and c <= phi. In the sum of all hats each of these counts four
 times at most, divided by d, and sum_j phi(z_j) <= 1/d + phi(0): that is at most ``hat_error`` for the least d.
 """
