@@ -26,9 +26,10 @@ PLANS = (
 )  # fmt: skip
 """Nodes along q to a standard deviation of the noise, and lines' largest distance in units of how far paths spread."""
 _WIDEN = 0.12  # of the distance from a limit, the lines' distance there
-_BEYOND, _DEVIATIONS = 5.0, 1.0  # of how far paths spread, and of the noise: where the grid ends if no limit is there
+_BEYOND, _DEVIATIONS = 3.5, 1.0  # of how far paths spread, and of the noise: where the grid ends if no limit is there
 _SLIVER = 1e-3
 _INWARD = 1e-12  # by which lines lie inside of a limit, for rounding
+_FINE, _FEWEST = 4.0, 3  # lines that meet every third node at most, if they are closer than wanted by so much
 _GAP = 10  # lines between the places where paths meet two limits, or else one lattice serves both
 _LEAST, _MOST = 60, 2000  # lines over the grid, at least, and nodes along an axis, at most
 _SAMPLES = 9
@@ -146,7 +147,7 @@ class Layout:
                     last = place
             found.append(np.array(places))
         lines = np.unique(np.concatenate(found))
-        return lines[np.concatenate([[True], np.diff(lines[:-1]) > widest / 1000, [True]])]
+        return np.asarray(lines[np.concatenate([[True], np.diff(lines[:-1]) > widest / 1000, [True]])])
 
     def _filled(self, lines: Array, finest: float, widest: float) -> Array:
         """More lines between those that are farther apart than wanted, but for the closest ones."""
@@ -162,16 +163,18 @@ class Layout:
             wanted = np.minimum(np.maximum(_WIDEN * away, finest), max(widest, finest))
             if b - a > 1.5 * wanted.max():
                 found.append(graded_axis(a, b, places, wanted))
-        return np.unique(np.concatenate([lines, *found]))
+        return np.asarray(np.unique(np.concatenate([lines, *found])))
 
     def _oblique(self, width: float, widest: float) -> Grid:
         """Lines that meet the limits of p at nodes, for the same reason."""
         shear, (low, high) = abs(self.work.shear), (self.low[0], self.high[0])
         inward = _INWARD * (1 + abs(self.y[0]) + abs(self.y[1]))
+        every = min(max(int(widest / (_FINE * shear * width)), 1), _FEWEST)
         if len(self.near) == 2 and self.near[0][1] + _GAP * shear * width > self.near[1][0]:
-            width = (high - low - 2 * inward) / (shear * math.ceil((high - low) / (shear * width)))
+            step = shear * every
+            width = (high - low - 2 * inward) / (step * math.ceil((high - low) / (step * width)))
         nodes = self.q[0] + width * np.arange(math.floor((self.q[1] - self.q[0]) / width) + 1)
-        turned, parts = self.work.shear * nodes, [np.array(self.y)]
+        turned, parts = self.work.shear * nodes[::every], [np.array(self.y)]
         if np.isfinite(low):
             parts.append(low - turned + inward)
         if np.isfinite(high):
@@ -179,7 +182,7 @@ class Layout:
         lines = np.sort(np.concatenate(parts))
         lines = lines[np.concatenate([[True], np.diff(lines) > 0.3 * shear * width])]
         inner = nodes[(nodes > self.q[0] + 0.3 * width) & (nodes < self.q[1] - 0.3 * width)]
-        axes = self._filled(lines, shear * width, widest), np.concatenate([[self.q[0]], inner, [self.q[1]]])
+        axes = self._filled(lines, every * shear * width, widest), np.concatenate([[self.q[0]], inner, [self.q[1]]])
         if max(map(len, axes)) > 2 * _MOST:
             raise InfeasibleError("value functions on lines would need too many of these.")
         return Grid(axes=axes)
