@@ -134,6 +134,58 @@ def test_one_step_back_lies_above_the_mean_everywhere(kind, ends):
     assert kind in ("steep", "jump") or np.median(loose) < 0.6
 
 
+ALONE = {
+    "twist": (lambda y, q: -y * q, lambda x: [0.5 * (x[0] + x[1]), 0.5 * (x[0] + x[1])]),
+    "bend": (lambda y, q: -q * q, lambda x: [0.5 * x[0], 0.7 * x[1]]),
+    "kink of m": (lambda y, q: q + 0 * y, lambda x: [0.5 * x[0], -abs(x[1])]),
+    "kink of y": (lambda y, q: y + 0 * q, lambda x: [-0.5 * abs(x[1]), 0.5 * x[1]]),
+    "kinks of lines": (lambda y, q: -abs(y - 0.05) + 0 * q, lambda x: [0.9 * x[0] + 0.02, 0.5 * x[1]]),
+}
+
+
+@pytest.mark.parametrize("name", list(ALONE))
+def test_what_cells_pay_is_needed(name):
+    """Functions for which one payment alone is due: without it the middle of a cell would lie above the corners."""
+    function, step = ALONE[name]
+    system = cb.DiscreteSystem(step, states=2, noise=cb.Gaussian(std=[0, 0.05]))
+    work = directed(cb.Problem(system, initial=[0, 0], safe=HALF_SPACES, horizon=2))
+    y, q = np.concatenate([np.linspace(-1, 0.05, 12), np.linspace(0.13, 1, 11)]), np.linspace(-1.1, 1.2, 21)
+    grid = Grid(axes=(y, q))
+    value = Lines(nodal=0.4 * np.asarray(function(y[:, None], q) + 0 * y[:, None]), below=0.0, above=0.0)
+    means = means_of(work, 0, grid, grid, ranges_of(q, work.noise))
+    found, short = means.back(value, np.full(means.landing.live.size, np.nan), math.inf), []
+    for i, j in np.ndindex(*grid.shape):
+        place, m = (y[i] + y[i + 1]) / 2, (q[j] + q[j + 1]) / 2
+        if abs(m) < 0.8:
+            end = step([place, m])
+            ends = [step([a, b]) for a in y[i : i + 2] for b in q[j : j + 2]]
+            mean, *corners = (mean_along(value.nodal, y, q, (0, 0), *one, work.noise) for one in (end, *ends))
+            assert mean <= found[i : i + 2, j : j + 2].mean() + 1e-13
+            short.append(mean - np.mean(corners))
+    assert max(short) > 1e-4
+
+
+def test_lines_are_crossed_as_unevenly_as_is_granted():
+    rng, (problem, _) = np.random.default_rng(5), turned("steep")
+    work = directed(problem)
+    y, q = np.sort(np.append(rng.uniform(-1, 1, 15), [-1, 1])), np.linspace(-0.6, 0.7, 8)
+    mesh = ranges_of(q, work.noise).mesh
+    landing = landing_of(work, 0, Grid(axes=(y, q)), y, mesh)
+    image = landing.y.reshape(len(y), len(q))
+    cells = [(i, j) for k, (i, j) in enumerate(np.ndindex(len(y) - 1, len(q) - 1)) if landing.live[k]]
+    lines = landing.crossed.entries[landing.crossed.start] // (len(mesh) - 1)
+    for cell, line, weight in zip(landing.cell, lines, landing.weight):
+        (i, j), least = cells[cell], 0.0
+        along = image[i, j : j + 2], image[i + 1, j : j + 2], np.linspace(0, 1, 41)
+        across = image[i : i + 2, j], image[i : i + 2, j + 1], [0.0, 1.0]
+        for one, two, shares in (along, across):
+            begin, change = one[0] + np.multiply(shares, one[1] - one[0]), two[0] - one[0]
+            change = change + np.multiply(shares, two[1] - two[0] - one[1] + one[0])
+            place = np.clip((y[line] - begin) / change, 0, 1)
+            least += (np.abs(change) * place * (1 - place)).max()
+        assert weight >= least - 1e-12
+
+
 @pytest.mark.parametrize("start", [-0.5, 0.0, 0.39])
 def test_one_step_is_known_in_closed_form(start):
     """The first step moves x to x + h v, whatever the noise does; a limit of v is met by a normal tail."""
