@@ -145,7 +145,7 @@ class _Induction:
         if means is None:
             return 1.0, 0.0
         zone, upper, lower = _Zone(safe=safe, broken=broken), 1.0, 0.0
-        if above is not None and safe[meets].all():
+        if above is not None:
             fixed = np.where(meets, self._fixed_above(means, zone), -np.inf)
             found = means.back(above, fixed, 1.0)
             upper = float(np.maximum.reduce(corners(found)).ravel()[meets].max())
