@@ -9,7 +9,9 @@ import pytest
 from scipy.special import ndtr
 
 import certbound as cb
-from certbound.errors import InfeasibleError
+from certbound.errors import CertificateError, InfeasibleError
+from certbound.safety.answers import EngineAnswer
+from certbound.safety.certificates import values_proof
 from certbound.safety.engines.values import values_engine
 from certbound.values.directed import bound_directed_failure
 from certbound.values.directed.cell_landings import landing_of
@@ -53,7 +55,8 @@ def simulated(problem, paths, seed=0):
     x = np.tile(np.asarray(problem.initial.hull().mid, dtype=float), (paths, 1))
     for t in range(problem.horizon):
         x = np.asarray(tape(float(t), *x.T)) + rng.standard_normal((len(x), gain.shape[1])) @ gain.T
-        x = x[np.all([one.region.contains(x) != one.outside for one in problem.safe], axis=0)]
+        due = [one for one in problem.safe if one.during is None or one.during[0] <= t + 1 <= one.during[1]]
+        x = x[np.all([one.region.contains(x) != one.outside for one in due], axis=0)] if due else x
     return 1 - len(x) / paths
 
 
@@ -240,8 +243,7 @@ CASES = {
 def test_simulated_paths_leave_as_often(name):
     problem = CASES[name]
     found = bound_directed_failure(problem, seconds=4.0)
-    paths = 100_000 if name != "window" else 0
-    share = simulated(problem, paths) if paths else 0.5 * (found.lower + found.upper)
+    share = simulated(problem, 100_000)
     away = 5 * math.sqrt(max(share, 1e-5) / 1e5)
     assert found.lower - away <= share <= found.upper + away
     assert found.upper < (12 if name == "obstacle" else 2.5) * share + 1e-5
@@ -311,6 +313,14 @@ def test_the_engine_asks_it_where_chains_said_little(monkeypatch):
     answer = values_engine(servo(horizon=5, initial=(0, 0), std=0.06))
     assert answer.applicable
     assert answer.log10_delta < -1.5
+
+
+def test_no_certificate_is_written_where_chains_hardly_show_it():
+    problem = servo(horizon=8, initial=(0, 0), std=0.1)
+    found = bound_directed_failure(problem, seconds=0.1)
+    answer = EngineAnswer(log10_delta=-3.5, method="values", details=found)
+    with pytest.raises(CertificateError, match="one direction"):
+        values_proof(problem, answer)
 
 
 @pytest.mark.parametrize(
