@@ -24,6 +24,7 @@ from certbound.watch import OutOfTime, poll
 
 _STEP_SECONDS, _IMAGE_SECONDS = 5e-7, 1.5e-5  # what a node takes for one step, both bounds, and to find where it lands
 _FIRST = 0.2  # share of the seconds for a first grid
+_MOST_FIRST = 15  # times that, for which the coarsest one is refused
 _TALLEST = 1e3
 
 
@@ -62,7 +63,7 @@ def bound_directed_failure(
         apart, grid, cost = found
         try:
             most, least = _Induction(layout, grid).bounds()
-        except OutOfTime:
+        except (OutOfTime, InfeasibleError):
             if not tried:
                 raise
             break
@@ -93,7 +94,7 @@ def _finest(layout: Layout, seconds: float, *, first: bool) -> tuple[float, Grid
         cost = nodes * (horizon * _STEP_SECONDS + images * _IMAGE_SECONDS)
         if cost > seconds and (best is not None or not first):
             break
-        if cost > 20 * seconds:
+        if cost > _MOST_FIRST * seconds:
             raise InfeasibleError(f"value functions on lines would take about {cost:.0f} s on their coarsest grid.")
         best = plan[1], grid, cost
     return best
@@ -174,7 +175,7 @@ class _Induction:
         if self._means is None or not self.work.steady:
             self._means = means_of(self.work, t, self.grid, self.grid, self.ranges)
         if self._means is None:
-            raise InfeasibleError("value functions on lines would need more than a gigabyte.")
+            raise InfeasibleError("value functions on lines would need more than half a gigabyte.")
         return self._means
 
     def _zone_at(self, t: int) -> _Zone:

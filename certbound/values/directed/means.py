@@ -23,7 +23,8 @@ from certbound.values.grids import Grid, corners
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-_MOST_ENTRIES = 120_000_000
+_MOST_ENTRIES = 40_000_000  # half a gigabyte
+_ROWS = 16384
 _UNIT = 2.0**-53
 
 
@@ -84,10 +85,13 @@ def means_of(work: Directed, t: int, grid: Grid, after: Grid, ranges: Ranges) ->
     if 2 * width * len(place) > _MOST_ENTRIES:
         return None
     first = np.clip(first, 0, len(q) - width)
-    hats = hat_means(q, m, s, first, width)
-    column = (line * len(q) + first)[:, None] + np.arange(width)
-    data = np.concatenate([hats * (1 - share[:, None]), hats * share[:, None]], axis=1)
-    entries = np.concatenate([column, column + len(q)], axis=1).astype(np.int32)
+    data, entries = np.empty((len(place), 2 * width)), np.empty((len(place), 2 * width), dtype=np.int32)
+    for start in range(0, len(place), _ROWS):
+        part = slice(start, start + _ROWS)
+        hats, upper = hat_means(q, m[part], s, first[part], width), share[part, None]
+        column = (line * len(q) + first)[part, None] + np.arange(width)
+        data[part, :width], data[part, width:] = hats * (1 - upper), hats * upper
+        entries[part, :width], entries[part, width:] = column, column + len(q)
     index = (np.arange(len(place) + 1) * (2 * width)).astype(np.int32)
     shape = (len(place), len(y) * len(q))
     return Means(
