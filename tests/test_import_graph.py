@@ -52,7 +52,7 @@ tubes.exact
 tubes
 values
 values.continuous values.discrete
-values.semilagrangian values.chains
+values.semilagrangian values.chains values.directed
 simulation.compiled
 simulation
 simulation.estimates

@@ -89,21 +89,23 @@ def induction_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0, *,
 
 
 def _check_pieces(problem: Problem, answer: EngineAnswer, lower: bool) -> None:
-    """Refuse what constants on cells, all that the checker knows of noise that the state multiplies, hardly show.
+    """Refuse what constants on cells, all that the checker knows of such noise, hardly show.
 
     Their error falls with the cells' size, which is a quarter of the coarsest one at last.
     """
     system = problem.system
-    if not isinstance(system, DiscreteSystem) or system.gain is None or system.dimension != 2:
+    if not isinstance(system, DiscreteSystem) or system.dimension != 2:
+        return
+    if system.gain is None and not system.noise.gaussian:
         return
     coarse = bound_chain(problem, seconds=1e-3)
     level, found = 10 ** _level(problem, answer, None, lower=lower), answer.log10_lower if lower else answer.log10_delta
     at_last = (3 * 10 ** (found or 0.0) + (coarse.lower if lower else coarse.upper)) / 4
     if at_last < level if lower else at_last > level:
         raise CertificateError(
-            "the checker knows noise that the state multiplies in two states by functions that are constant on cells, "
-            f"which on its finest grid would say about {at_last:.2g}, not {level:.2g}; the bound stands without a "
-            "certificate."
+            "in two states the checker knows noise that the state multiplies, or that has one direction, by functions "
+            f"that are constant on cells, which on its finest grid would say about {at_last:.2g}, not {level:.2g}; the "
+            "bound stands without a certificate."
         )
 
 

@@ -21,6 +21,7 @@ from certbound.values.continuous import (
     is_confined,
     leaves_surely,
 )  # fmt: skip
+from certbound.values.directed import bound_directed_failure
 from certbound.values.discrete import FailureBounds, bound_failure, bound_long_run
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
@@ -140,6 +141,12 @@ def _by_rate(problem: Problem) -> EngineAnswer | None:
 
 
 def _failure(problem: Problem, limit: float) -> FailureBounds:
+    try:  # what noise along one direction leaves to chains otherwise
+        found: FailureBounds | None = bound_directed_failure(problem, seconds=limit, delta=problem.delta)
+    except InfeasibleError:
+        found = None
+    if found is not None and (found.upper < 1 or found.lower > 0):
+        return found
     found = bound_long_run(problem, seconds=limit, delta=problem.delta)
     if found is not None:
         return found
