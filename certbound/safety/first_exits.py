@@ -184,6 +184,8 @@ def _check(problem: Problem) -> None:
             f"exit times are bounded in one state, the problem has {problem.system.dimension}; sweep over the horizon "
             "(`certbound sweep --over horizon=A:B:N`) for bounds at single times."
         )
+    if not problem.constraints:
+        raise InfeasibleError("exit times need a limit by which paths may leave; add a constraint.")
     if len(problem.starts) > 1 or problem.initial.random:
         raise InfeasibleError("exit times need one set of starts; take the members of a union one by one.")
     if problem.unknown:
