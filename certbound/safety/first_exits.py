@@ -179,9 +179,10 @@ def _check(problem: Problem) -> None:
     check_end(problem, "a curve of exit times")
     if problem.ending:
         raise InfeasibleError("exit times count leaving the domain as an exit; leave `leaving` out.")
-    if problem.system.dimension != 1:
+    states = len(problem.closed_loop.outputs)  # ValueError of inputs without a plan
+    if states != 1:
         raise InfeasibleError(
-            f"exit times are bounded in one state, the problem has {problem.system.dimension}; sweep over the horizon "
+            f"exit times are bounded in one state, the problem has {states}; sweep over the horizon "
             "(`certbound sweep --over horizon=A:B:N`) for bounds at single times."
         )
     if not problem.constraints:

@@ -236,6 +236,12 @@ def test_what_is_not_served_says_so(changes, message):
         cb.bound_exit_times(brownian().replace(**changes))
 
 
+def test_inputs_without_a_plan_are_refused_as_such():
+    system = cb.ContinuousSystem(lambda x, u: u - x, states=1, inputs=cb.Box([-1], [1]), diffusion=[[0.3]])
+    with pytest.raises(ValueError, match="and no plan"):
+        cb.bound_exit_times(cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1))
+
+
 def test_two_states_are_refused():
     system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=np.eye(2))
     safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
