@@ -152,7 +152,7 @@ def make_setting(problem: Problem, low: Array, high: Array) -> Setting:
     walls: list[Wall | None] = []
     inside: list[Interval] = []
     for constraint in problem.constraints:
-        more, forms = _constraint(problem, constraint, center, width, start)
+        more, forms = _constraint(problem, constraint, center, width, start, jumps)
         walls += more
         inside += forms
     known = as_forms(inside, n + 1)
@@ -218,21 +218,26 @@ def _start(problem: Problem, center: Array, width: Array) -> Start:
 
 
 def _constraint(
-    problem: Problem, constraint: Inside, center: Array, width: Array, start: Start
+    problem: Problem, constraint: Inside, center: Array, width: Array, start: Start, jumps: bool
 ) -> tuple[list[Wall | None], list[Interval]]:
-    """The walls of a constraint that is no side of the box, and the forms that are at least 0 where it holds."""
+    """The walls of a constraint that is no side of the box, and the forms that are at least 0 where it holds.
+
+    Where paths jump V is asked for from the first step on: a start in an obstacle, or on its edge, has failed before.
+    """
     n, region = len(center), constraint.region
     places = region.places(n)
     if isinstance(region.form, Quadratic):
         form = ball_form(region.center_at(), region.form.radius, places, center, width)
         inner = -form if constraint.outside else form
-        _check_start(start, inner, constraint.label)
+        _check_start(start, inner, constraint.label, strictly=jumps and constraint.outside)
         return [Wall(label=constraint.label, row=None, forms=as_forms([-inner], n + 1))], [inner]
     rows = []
     for normal, bound in zip(region.form.normals, region.form.bounds):
         shift = (Interval.point(normal) * Interval.point(region.center_at())).sum() + Interval.point(bound)
         rows.append(scaled_row(region.lifted(normal, n), shift, center, width))
     if constraint.outside:
+        if jumps:
+            _check_apart(start, rows, constraint.label)
         forms = [-linear_form(row) for row in rows]  # the obstacle: every row . z <= 0
         return [Wall(label=constraint.label, row=None, forms=as_forms(forms, n + 1))], []
     walls, inside = [], []
@@ -244,12 +249,40 @@ def _constraint(
     return walls, inside
 
 
-def _check_start(start: Start, form: Interval, label: str) -> None:
-    """Refuse starts that may lie where a form is negative."""
-    z = concatenate([Interval(start.low, start.high), Interval.point(np.ones(1))])
+def _check_start(start: Start, form: Interval, label: str, *, strictly: bool = False) -> None:
+    """Refuse starts that may lie where a form is negative, or (``strictly``) 0."""
+    z = _around(start)
     value = (z.reshape(-1, 1) * form * z.reshape(1, -1)).sum()
-    if not value.lo >= 0:
+    if not (value.lo > 0 if strictly else value.lo >= 0):
         raise InfeasibleError(f"the starts may touch the boundary of '{label}'.")
+
+
+def _check_apart(start: Start, rows: Sequence[Interval], label: str) -> None:
+    """Refuse starts of which it is not shown that none lies where every row . z <= 0.
+
+    One combination of the rows by weights that are not negative is positive over the box of the starts; a linear
+    program proposes it.
+    """
+    from scipy.optimize import linprog
+
+    z, count, n = _around(start), len(rows), len(start.low)
+    table = np.stack([row.mid for row in rows])
+    middle, half = (start.low + start.high) / 2, (start.high - start.low) / 2
+    slopes, value = table[:, :n], table[:, :n] @ middle + table[:, n]
+    signs = [np.hstack([sign * slopes.T, -np.eye(n)]) for sign in (1, -1)]  # |slopes' w| <= u
+    found = linprog(np.concatenate([-value, half]), A_ub=np.vstack(signs), b_ub=np.zeros(2 * n),
+                    A_eq=[[1.0] * count + [0.0] * n], b_eq=[1.0], method="highs")  # fmt: skip
+    weights = np.eye(count) if found.x is None else np.vstack([np.eye(count), np.maximum(found.x[:count], 0.0)])
+    for weight in weights.tolist():
+        mixed = sum((row * share for row, share in zip(rows, weight) if share), Interval.point(np.zeros(n + 1)))
+        if (mixed * z).sum().lo > 0:
+            return
+    raise InfeasibleError(f"the starts may touch '{label}', where they have failed.")
+
+
+def _around(start: Start) -> Interval:
+    """z over a box around the starts."""
+    return concatenate([Interval(start.low, start.high), Interval.point(np.ones(1))])
 
 
 def _flat(problem: Problem, center: Array, width: Array, row: Interval, label: str) -> Wall | None:

@@ -179,11 +179,14 @@ def _check(problem: Problem) -> None:
     check_end(problem, "a curve of exit times")
     if problem.ending:
         raise InfeasibleError("exit times count leaving the domain as an exit; leave `leaving` out.")
-    if problem.system.dimension != 1:
+    states = len(problem.closed_loop.outputs)  # ValueError of inputs without a plan
+    if states != 1:
         raise InfeasibleError(
-            f"exit times are bounded in one state, the problem has {problem.system.dimension}; sweep over the horizon "
+            f"exit times are bounded in one state, the problem has {states}; sweep over the horizon "
             "(`certbound sweep --over horizon=A:B:N`) for bounds at single times."
         )
+    if not problem.constraints:
+        raise InfeasibleError("exit times need a limit by which paths may leave; add a constraint.")
     if len(problem.starts) > 1 or problem.initial.random:
         raise InfeasibleError("exit times need one set of starts; take the members of a union one by one.")
     if problem.unknown:

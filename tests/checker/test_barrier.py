@@ -86,6 +86,21 @@ def test_where_the_generator_is_negative_its_exponential_is_not_looked_at(monkey
     assert report.valid, report.reason
 
 
+@pytest.mark.parametrize("obstacle", [
+    cb.Box([0.5, 0.4], [0.7, 0.8]), cb.Polytope([[-1, 0], [0, -1], [1, 1]], [-0.5, -0.4, 1.5]),
+])  # fmt: skip
+def test_faces_of_an_obstacle_end_and_v_may_be_low_on_what_goes_on_beyond(obstacle: cb.Box | cb.Polytope) -> None:
+    """V = 8 |x|^2 is 3.28 at the nearest corner, and 2 or 1.28 on the lines through it."""
+    system = cb.ContinuousSystem(lambda x: -x, states=2, diffusion=0.3 * np.eye(2))
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(obstacle)]
+    problem = cb.Problem(system, initial=cb.Box([-0.1, -0.1], [0.1, 0.1]), safe=safe, horizon=0.5)
+    report = check_data(by_hand(problem, 8.0, 1.441, 0.161, 3.279))
+    assert report.valid, report.reason
+    refused = check_data(by_hand(problem, 8.0, 1.441, 0.161, 3.281))
+    assert not refused.valid
+    assert "where a constraint breaks" in refused.reason
+
+
 def test_three_states_a_ball_an_obstacle_and_noise_that_depends_on_the_state() -> None:
     """V = 12 |x|^2 in the unit ball with a face cut off, beside a ball: the least of V on the boundary is decided."""
     system = cb.ContinuousSystem(

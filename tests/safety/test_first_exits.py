@@ -225,6 +225,7 @@ def test_every_start_of_a_set_counts():
     ("changes", "message"),
     [
         ({"safe": [cb.Inside(cb.Box([-1.0], [1.0]), during=(0, 1))]}, "limits that always hold and stand still"),
+        ({"safe": []}, "need a limit by which paths may leave"),
         ({"initial": cb.GaussianStart([0.0], [[0.01]])}, "need one set of starts"),
         ({"initial": [cb.Box([0.0], [0.1]), cb.Box([0.2], [0.3])]}, "need one set of starts"),
         ({"reach": cb.Box([0.5], [0.6])}, "the problem has a target"),
@@ -234,6 +235,12 @@ def test_every_start_of_a_set_counts():
 def test_what_is_not_served_says_so(changes, message):
     with pytest.raises(InfeasibleError, match=message):
         cb.bound_exit_times(brownian().replace(**changes))
+
+
+def test_inputs_without_a_plan_are_refused_as_such():
+    system = cb.ContinuousSystem(lambda x, u: u - x, states=1, inputs=cb.Box([-1], [1]), diffusion=[[0.3]])
+    with pytest.raises(ValueError, match="and no plan"):
+        cb.bound_exit_times(cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1))
 
 
 def test_two_states_are_refused():

@@ -326,3 +326,10 @@ def test_units_do_not_matter_until_floats_end() -> None:
     assert bound(1e12).upper == pytest.approx(bound(1.0).upper, rel=1e-6)
     with pytest.raises(InfeasibleError, match="another unit"):
         bound(1e100)
+
+
+def test_a_drift_that_is_undefined_where_paths_may_be_is_refused_in_words() -> None:
+    """What a proposal was made of was no number, and a linear solver said so."""
+    system = cb.ContinuousSystem(lambda x: [0.1 * np.log(x[0]) - x[0]], states=1, diffusion=[[0.2]])
+    with pytest.raises(InfeasibleError, match="undefined somewhere in the safe set"):
+        bound_exits(cb.Problem(system, initial=[0.1], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1))

@@ -132,7 +132,7 @@ class StepSet:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Part:
-    """A part of the boundary: the points of ``box`` that ``skip`` does not rule out; ``exact``: that lie in the set."""
+    """A part of the boundary: points of ``box`` that ``skip`` does not rule out; ``exact``: all that lie in the set."""
 
     box: list[Side]
     skip: Skip
@@ -232,7 +232,8 @@ class SafeSet:
             for number, form in enumerate(shape.forms if shape.bound is None else shape.forms[:1]):
                 flat = self._flat(shape, number) if shape.bound is None and len(form) == 1 else self.hull
                 if flat is not None:
-                    parts.append(Part(box=flat, skip=self._misses(shape, number), exact=flat is not self.hull))
+                    exact = flat is not self.hull and not (shape.outside and len(shape.forms) > 1)  # it ends within
+                    parts.append(Part(box=flat, skip=self._misses(shape, number), exact=exact))
         return parts
 
     def _flat(self, shape: _Shape, number: int) -> list[Side] | None:

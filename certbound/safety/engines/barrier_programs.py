@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array, Integers
+from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
@@ -130,12 +131,17 @@ class Polynomials:
         return program, (c, constant), (top, growth)
 
     def _terms(self, exponents: Integers, inner: Array) -> tuple[Array, list[Array]]:
-        """The generator's expression at points, linear @ c + 1/2 sum_j (roots[j] @ c)^2: matrices (points, K)."""
+        """The generator's expression at points, linear @ c + 1/2 sum_j (roots[j] @ c)^2: matrices (points, K).
+
+        InfeasibleError where the model is undefined at one of them.
+        """
         states = inner[:, 1 : self.n + 1]
         drift = compile_numpy(self.problem.closed_loop)(*inner.T)
         diffusion = self.system.diffusion
         given = compile_numpy(diffusion)(*inner[:, : self.n + 1].T) if isinstance(diffusion, Tape) else diffusion
         spread = np.broadcast_to(given, (len(inner), self.n, self.noises))
+        if not (np.isfinite(drift).all() and np.isfinite(spread).all()):
+            raise InfeasibleError("the model is undefined somewhere in the safe set, where barriers are bounded.")
         slopes = np.stack([self.monomials(exponents, states, (i,)) for i in range(self.n)])
         linear = np.einsum("pi,ipk->pk", drift, slopes)
         square = np.einsum("pij,pkj->pik", spread, spread)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.values.continuous.surface import Surface
 from certbound.watch import poll
 
@@ -74,7 +75,7 @@ def sketch(
 ) -> Sketch:
     """A rough solution, accurate to some per cent at any size of u (monotone rates, an L-stable step of order 2).
 
-    u is 0 at the horizon unless ``begin`` says what it is.
+    u is 0 at the horizon unless ``begin`` says what it is. InfeasibleError where the model is undefined at a node.
     """
     from scipy.linalg import solve_banded
 
@@ -101,6 +102,8 @@ def sketch(
                 along = float(np.abs(line.drift(line.horizon - end, x[[side]])).max()) / abs(x[side] - x[1 + 3 * side])
                 bands[1, side] += _GAMMA * step * along
                 bands[row, 1 + 3 * side] = -_GAMMA * step * along
+        if not np.isfinite(bands).all():
+            raise InfeasibleError("the model is undefined somewhere in the safe set; value functions prove nothing.")
         before = float(np.max(u[inside]))
         stage = solve_banded((1, 1), bands, u)
         u = np.maximum(solve_banded((1, 1), bands, u + (1 / _GAMMA - 1) * (stage - u)), 0.0)

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 import certbound as cb
 from certbound.checker import check_data, parse
-from certbound.errors import CertificateError
+from certbound.errors import CertificateError, InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.safety.answers import EngineAnswer
 from certbound.safety.certificate import problem_data
@@ -279,3 +279,14 @@ def test_a_proposal_that_is_far_below_at_the_start_leaves_no_tolerance_of_0() ->
     safe = [cb.Inside(cb.Box([-1.6], [1.6]))]
     found = barrier_engine(scalar(initial=[0.3], safe=safe, horizon=10.0, delta=1e-3).replace(system=system))
     assert found.reason == "no polynomial barrier was found."
+
+
+@pytest.mark.parametrize(("drift", "noise"), [
+    (lambda x: [np.log(x[0])], [[0.3]]), (lambda x: -x, lambda x: [[np.sqrt(x[0])]])
+])
+def test_a_model_that_is_undefined_in_the_safe_set_is_refused_in_words(drift: Any, noise: Any) -> None:
+    """It ended as a defect, in the words of a solver that was given no numbers."""
+    system = cb.ContinuousSystem(drift, states=1, diffusion=noise)
+    problem = cb.Problem(system, initial=[0.1], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1)
+    with pytest.raises(InfeasibleError, match="undefined somewhere in the safe set"):
+        barrier_engine(problem)

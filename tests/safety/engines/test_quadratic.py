@@ -41,3 +41,24 @@ def test_who_starts_on_the_edge_of_an_obstacle_has_failed(obstacle, method: str)
     safe = [cb.Outside(obstacle), cb.Inside(cb.Box([-50], [50]))]
     problem = cb.Problem(system, initial=[0.0], safe=safe, horizon=1, delta=0.3)
     assert cb.verify_safety(problem, method=method, time_limit=5).log10_delta == 0
+
+
+_SQUARE, _DISC = cb.Box([-0.5, -0.5], [0.5, 0.5]), cb.Ball([0.0, 0.0], 0.5)
+
+
+@pytest.mark.parametrize(("start", "obstacle", "apart"), [
+    (_SQUARE, cb.Polytope([[-1, 0], [0, -1], [1, 1]], [-0.4, -0.4, 1.4]), False),  # a corner of it
+    (_SQUARE, cb.Polytope([[-1, 0], [0, -1], [1, 1]], [-0.5, 0, 4]), False),  # a face of it, from beside
+    (_SQUARE, cb.Polytope([[1, 1], [-1, -1]], [1, -1]), False),  # of no width, at a corner
+    (_DISC, cb.Box([0.5, -1], [2, 1]), False),
+    (_SQUARE, cb.Polytope([[1, -1], [1, 1], [-1, 0]], [2, 2, -0.6]), True),
+    (_SQUARE, cb.Polytope([[-3, 1], [1, -3]], [-1.5, -1.5]), True),  # its apex is kept off by a sum of faces alone
+    (_DISC, cb.Box([0.6, -1], [2, 1]), True),
+])  # fmt: skip
+def test_in_discrete_time_starts_are_shown_to_keep_off_obstacles(start, obstacle, apart: bool) -> None:
+    """Starts that reach into one, or to its edge, have failed; the steps that V looks at lead away from it."""
+    system = cb.DiscreteSystem(lambda x: 0.1 * x, states=2, noise=cb.Uniform(halfwidth=0.02))
+    safe = [cb.Inside(cb.Box([-3, -3], [3, 3])), cb.Outside(obstacle)]
+    problem = cb.Problem(system, initial=start, safe=safe, horizon=3, delta=0.1)
+    found = quadratic_engine(problem, Request())
+    assert found.log10_delta < -10 if apart else not found.applicable
