@@ -163,8 +163,8 @@ class _Search:
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self._thoroughly(name, Request(before=first.details))
-        if not self.safe:
-            self._at_length(names)
+        if not self.safe and not self._at_length(names):
+            self._at_last(names)
 
     def below(self, names: tuple[str, ...]) -> None:
         """Ask for lower bounds that take little."""
@@ -195,6 +195,13 @@ class _Search:
                 with self.watch.share(1 - _LAST):
                     self.ask(name, Request(before=first.details, at_length=True))
         return self.safe
+
+    def _at_last(self, names: tuple[str, ...]) -> None:
+        """Where nobody proved anything of few states, ask thoroughly whose bound falls with the time granted."""
+        for name in (name for name in names if ENGINES[name].refines and name not in self.full):
+            few = self.problem.system.dimension < _FEW and not self.bounded and not self.refuted
+            if few and name in self.answers and self.answers[name].applicable and not self.answers[name].conclusive:
+                self._thoroughly(name, Request(before=self.answers[name].details))
 
     def endlessly(self, names: tuple[str, ...]) -> bool:
         """Whether a function of one state settles a target without an end, which others meet at some late time."""
