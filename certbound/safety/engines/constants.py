@@ -268,7 +268,7 @@ class _Work:
             words = "is proved so widely only that it leaves" if lost else "already leaves"
             short = "" if lost else f" (short by {-worst.margin:.3g})"
             return replace(
-                held,
+                answer if lost else held,
                 reason=f"the noise-free reach tube {words} no room for '{worst.label}' at "
                 f"{self._when(worst.time)}{short}; {self._cure}.",
             )
@@ -322,9 +322,10 @@ class _Work:
             fits = level <= math.log10(target)
         worst = erosion.tightest(needed)
         place = worst.place | {"margin": max(worst.margin, 0.0) if fits else worst.margin}
+        rough = not fits and _taken(erosion, needed) > _ROUGH
         return replace(
             answer,
-            **place,
+            **({} if rough else place),
             log10_delta=level,
             reason=self._explained(erosion, needed, worst, level, fits),
             tube=tube,

@@ -79,8 +79,11 @@ def test_what_cannot_be_smaller_is_not_asked_to_be() -> None:
     problem = cb.Problem(
         system, initial=[-1.0694, -0.4617], safe=[cb.Inside(cb.HalfSpace([1.0, 0.0], 0.0))], horizon=20.0, delta=0.05
     )
-    rough = cb.verify_safety(problem, method="constants").reason
-    assert "much too rough here, which says nothing of the problem" in rough
-    assert "noise at most" not in rough
-    burst = cb.verify_safety(problem.replace(horizon=50.0), method="constants").reason
+    verdict = cb.verify_safety(problem, method="constants")
+    assert verdict.margin is None  # -1e9 says nothing
+    assert "much too rough here, which says nothing of the problem" in verdict.reason
+    assert "noise at most" not in verdict.reason
+    verdict = cb.verify_safety(problem.replace(horizon=50.0), method="constants")
+    assert verdict.margin is None
+    burst = verdict.reason
     assert "is proved so widely only that it leaves no room for 'v <= 0' at t = 50; try a shorter horizon." in burst
