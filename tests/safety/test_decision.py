@@ -442,3 +442,15 @@ def test_where_nobody_proved_anything_who_refines_is_asked_thoroughly_at_last(
     monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine))
     verdict = decide(problem(), watch=Watch(60, clock=clock, patient=False))
     assert verdict.status == ("SAFE" if other == 0 else "UNKNOWN")
+
+
+@pytest.mark.parametrize(("horizon", "first"), [(2000, "values"), (900, "linear")])
+def test_of_very_many_steps_a_function_of_one_state_is_asked_first(
+    monkeypatch: pytest.MonkeyPatch, clock: Time, horizon: int, first: str
+) -> None:
+    """A queue for 1e5 steps was UNKNOWN after 60 s, all of them of engines that look at every step."""
+    asked = scripted(monkeypatch, clock, {"linear": [(50, -4)], "values": [(1, -4)]})
+    verdict = decide(problem().replace(horizon=horizon), watch=Watch(60, clock=clock))
+    assert verdict.status == "SAFE"
+    assert asked[0] == first
+    assert (len(asked) == 1) == (first == "values")
