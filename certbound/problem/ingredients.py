@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -154,6 +154,8 @@ def checked_cost(value: Any, system: System) -> tuple[Array, Array] | None:
 
 def checked_unknown(value: Any, known: Sequence[str]) -> tuple[str, ...]:
     """Names of disturbances."""
+    if not isinstance(value, Iterable):
+        raise TypeError(f"`unknown` must be a list of names of disturbances, got {value!r}.")
     found = (value,) if isinstance(value, str) else tuple(value)
     for name in found:
         if name not in known:

@@ -81,7 +81,8 @@ class Law:
             checked = positive_definite(kind, value, strict=False)
         else:
             matrices = [level for level in self.levels if level.endswith("covariance")]
-            if np.ndim(value) > 1 and matrices:
+            rows = value if isinstance(value, list | tuple) else []  # perhaps of different lengths
+            if matrices and (getattr(value, "ndim", 0) > 1 or any(isinstance(row, list | tuple) for row in rows)):
                 raise ValueError(f"`{kind}` must be a number or a vector; a matrix is a {matrices[0]}=.")
             checked = vector(kind, value)
             if np.any(checked < 0):

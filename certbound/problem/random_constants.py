@@ -107,6 +107,8 @@ class Random:
         scale = float(self.law.factor[0, 0])
         for far in _FAR:
             low, high = self.mean - far * scale, self.mean + far * scale
+            if not (math.isfinite(low) and math.isfinite(high)):
+                raise ValueError(f"`random` must hold constants of a moderate size, got {self.describe()}.")
             if self.outside(low, high) <= tail:
                 break
         return low, high

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ def signal_names(
     name: str, given: Sequence[str] | None, box: Box | None, symbol: str, taken: Sequence[str]
 ) -> tuple[str, ...]:
     """The names of a signal's entries: the given ones, else the symbol with a number, and no name that is taken."""
+    if given is not None and not isinstance(given, Iterable):
+        raise TypeError(f"`{name}` must be a list of names, got {given!r}.")
     if box is None:
         if given:
             raise ValueError(f"`{name}` must come with bounds, got {list(given)} alone.")
@@ -52,13 +54,12 @@ def signal_names(
 
 def _noise_matrix(name: str, value: Any, states: Sequence[str]) -> Array:
     n = len(states)
+    cure = "; write np.diag([...]) for independent noise on every state" if isinstance(value, Mapping) else ""
     try:
-        raw = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        raw = np.asarray("")
-    if raw.dtype.kind not in "biufO":
-        raise TypeError(f"`{name}` must hold numbers, in rows of equal length, got {value!r}.")
-    array = raw.astype(float)
+        raw = np.asarray("" if cure else value)
+        array = (raw if raw.dtype.kind in "biufO" else np.asarray("")).astype(float)
+    except (TypeError, ValueError) as error:  # rows of different lengths too
+        raise TypeError(f"`{name}` must hold numbers, in rows of equal length, got {value!r}{cure}.") from error
     if array.ndim < 2 and n == 1:
         array = array.reshape(1, -1)
     if array.ndim == 0:

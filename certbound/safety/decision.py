@@ -33,6 +33,7 @@ from certbound.watch import OutOfTime, Watch, current_watch
 _log = logging.getLogger(__name__)
 
 _LARGE, _LASTING = 60, 100_000  # states beyond which nobody else is asked once one has proved SAFE; steps
+_LONG = 1000  # steps of one state beyond which a function of it is asked first
 _PATIENCE = 0.4  # of the time that is left, after which the other engines have a turn
 _TURN = 0.5  # of the time that is left then, for all of them
 _LAST = 0.2  # of the time that is left then, where none of them has much of a chance
@@ -163,8 +164,8 @@ class _Search:
             first = self.answers.get(name)
             if first is not None and first.applicable and not first.conclusive:
                 self._thoroughly(name, Request(before=first.details))
-        if not self.safe:
-            self._at_length(names)
+        if not self.safe and not self._at_length(names):
+            self._at_last(names)
 
     def below(self, names: tuple[str, ...]) -> None:
         """Ask for lower bounds that take little."""
@@ -196,12 +197,24 @@ class _Search:
                     self.ask(name, Request(before=first.details, at_length=True))
         return self.safe
 
+    def _at_last(self, names: tuple[str, ...]) -> None:
+        """Where nobody proved anything of few states, ask thoroughly whose bound falls with the time granted."""
+        for name in (name for name in names if ENGINES[name].refines and name not in self.full):
+            few = self.problem.system.dimension < _FEW and not self.bounded and not self.refuted
+            if few and name in self.answers and self.answers[name].applicable and not self.answers[name].conclusive:
+                self._thoroughly(name, Request(before=self.answers[name].details))
+
     def endlessly(self, names: tuple[str, ...]) -> bool:
-        """Whether a function of one state settles a target without an end, which others meet at some late time."""
-        for name in (name for name in names if self.late and self.problem.system.dimension == 1):
+        """Whether a function of one state settles a target without an end, which others meet at some late time.
+
+        Or so many steps that others, which look at all of them, take long.
+        """
+        system, plain = self.problem.system, self.problem.reach is None
+        asked = self.late or (plain and system.time == "discrete" and _LONG < self.problem.horizon < math.inf)
+        for name in (name for name in names if asked and system.dimension == 1):
             if ENGINES[name].endless:
                 self.ask(name, self.request)
-        return self.late and self.settled
+        return asked and self.settled
 
     def _in_full(self, names: tuple[str, ...], share: float) -> bool:
         """Ask once those that spared themselves where nobody proved anything, or may decide now; whether one did."""

@@ -180,3 +180,8 @@ def test_what_cannot_average_says_so():
         problem.replace(random={"gain": 0.3})
     with pytest.raises(ValueError, match="constant"):
         cb.simulate_exits(problem, paths=10, scenario=Scenario(disturbance="switching"))
+
+
+def test_a_law_that_reaches_beyond_all_numbers_is_refused_in_words():
+    with pytest.raises(ValueError, match=r"`random` must hold constants of a moderate size, got .*1e\+308"):
+        given('law = "gaussian", std = 1e308, mean = 1')

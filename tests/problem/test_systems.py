@@ -6,7 +6,7 @@ import pytest
 from certbound.problem.model.evaluation import compile_numpy
 from certbound.problem.model.tape import Tape
 from certbound.problem.model.tracing import trace
-from certbound.problem.noise import Bounded, Gaussian
+from certbound.problem.noise import Bounded, Gaussian, Uniform
 from certbound.problem.sets.regions import Ball, Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, from_control, linear_system
 
@@ -82,6 +82,27 @@ def test_discrete_noise_is_spread_over_the_noise_matrix():
     np.testing.assert_array_equal(quiet.noise.proxy, np.zeros((3, 3)))
     bounded = DiscreteSystem(lambda x: x, states=2, noise=Bounded(halfwidth=1.0, independent=False))
     np.testing.assert_array_equal(bounded.noise.proxy, 2 * np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"diffusion": {"x": 0.1}}, r"`diffusion` must hold numbers, .* got \{'x': 0.1\}; write np.diag"),
+        ({"diffusion": [[None], [1.0, 2.0]]}, "`diffusion` must hold numbers, in rows of equal length"),
+        ({"disturbance_names": 3}, "`disturbance_names` must be a list of names, got 3"),
+    ],
+)
+def test_what_is_no_matrix_or_list_is_refused_by_its_name(options, message):
+    with pytest.raises(TypeError, match=message):
+        ContinuousSystem(lambda x: -x, states=2, **options)
+
+
+def test_noise_in_rows_of_different_lengths_is_refused_by_its_name():
+    with pytest.raises(ValueError, match="`std` must be a number or a vector"):
+        Gaussian(std=[[1, 2], [3]])
+    with pytest.raises(TypeError, match="`halfwidth` must hold numbers"):
+        Uniform(halfwidth=[[1, 2], [3]])
+    np.testing.assert_array_equal(Gaussian(std=np.array(0.1)).std, [0.1])
 
 
 def test_twelve_states_from_matrices():

@@ -54,6 +54,20 @@ def test_a_certificate_claims_no_more_than_the_verdict(method: str) -> None:
     assert check_data(parse(json.dumps(data))).valid
 
 
+def test_over_a_jump_no_more_is_claimed_than_the_checker_sees() -> None:
+    """It counts the worst on the cells of a jump, the engine what both sides lead to."""
+    heated = cb.DiscreteSystem(
+        lambda x: x + 0.1 * (10 - x) + np.where(x < 20, 1.8, 0.0), states=["T"], noise=cb.Gaussian(std=0.2)
+    )
+    safe = [cb.Inside(cb.Box([17], [22.5]))]
+    problem = cb.Problem(heated, initial=[20.1], safe=safe, horizon=10, delta=1e-3)
+    verdict = verify_safety(problem, method="values")
+    assert verdict.log10_delta < -10
+    report = check_data(certificate_data(problem, verdict))
+    assert report.valid
+    assert -10 < (report.log10_proved or 0.0) <= -3
+
+
 def test_a_certificate_restated_claims_what_was_proved_of_it() -> None:
     problem = small()
     text = certificate_text(problem, verify_safety(problem, method="linear"))

@@ -426,3 +426,31 @@ def test_what_is_left_of_a_limit_of_ones_own_goes_to_who_refines(
     assert verdict.status == ("SAFE" if patient else "UNKNOWN")
     assert len(asked) == patient  # quadratic, which was farther off, has no need to go on
     assert all(20 < left < 27 for left in asked)
+
+
+@pytest.mark.parametrize("other", [0.0, -1.0])
+def test_where_nobody_proved_anything_who_refines_is_asked_thoroughly_at_last(
+    monkeypatch: pytest.MonkeyPatch, clock: Time, other: float
+) -> None:
+    """An epidemic in persons was UNKNOWN with 1 after 20 of 60 s; more of a grant than the first 5 s proved SAFE."""
+    scripted(monkeypatch, clock, {"linear": [(1, other)]})
+
+    def refine(problem: cb.Problem, request: Request) -> EngineAnswer:
+        clock.work(1, "refining")
+        return EngineAnswer(method="values", log10_delta=-4.0 if request.thorough else 0.0)
+
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine))
+    verdict = decide(problem(), watch=Watch(60, clock=clock, patient=False))
+    assert verdict.status == ("SAFE" if other == 0 else "UNKNOWN")
+
+
+@pytest.mark.parametrize(("horizon", "first"), [(2000, "values"), (900, "linear")])
+def test_of_very_many_steps_a_function_of_one_state_is_asked_first(
+    monkeypatch: pytest.MonkeyPatch, clock: Time, horizon: int, first: str
+) -> None:
+    """A queue for 1e5 steps was UNKNOWN after 60 s, all of them of engines that look at every step."""
+    asked = scripted(monkeypatch, clock, {"linear": [(50, -4)], "values": [(1, -4)]})
+    verdict = decide(problem().replace(horizon=horizon), watch=Watch(60, clock=clock))
+    assert verdict.status == "SAFE"
+    assert asked[0] == first
+    assert (len(asked) == 1) == (first == "values")

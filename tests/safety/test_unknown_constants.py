@@ -77,5 +77,7 @@ def test_bad_constants_are_refused():
         loads(TEXT.replace("[disturbances]", "[disturbances]\ngain = [0, 1]"))
     with pytest.raises(ValueError, match=r"`unknown` must name disturbances of the system, got 'gian'"):
         loads(TEXT).replace(unknown=["gian"])
+    with pytest.raises(TypeError, match="`unknown` must be a list of names of disturbances, got 3"):
+        loads(TEXT).replace(unknown=3)
     with pytest.raises(InfeasibleError, match="no bounds for unknown constants"):
         cb.bound_exit_times(loads(TEXT))

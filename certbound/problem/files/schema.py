@@ -269,25 +269,49 @@ def json_schema() -> dict[str, Any]:
 def explain(error: ValidationError) -> str:
     """The faults of a problem file in one line each, without the machinery."""
     lines: list[str] = []
-    for fault in error.errors():
-        keys = [str(part) for part in fault["loc"] if not (isinstance(part, str) and _is_machinery(part))]
-        message = fault["msg"].removeprefix("Value error, ")
-        key, plain = ".".join(keys), _PLAIN.get(fault["type"], "").format(**fault.get("ctx", {}))
-        if key in ("stay", "avoid", "reach") and fault["type"] == "list_type":
-            plain = f"must be a list of tables; write [[{key}]]"
+    faults = [(_key(fault), fault) for fault in error.errors()]
+    for key, fault in faults:
+        if fault["type"] == "dict_type" and isinstance(fault["input"], list) and any(_within(key, faults)):
+            continue  # a list may stand there too, and is what was meant: the others tell of it
+        message, plain = fault["msg"].removeprefix("Value error, "), _words(key, fault, faults)
         if any(line.startswith((f"`{key}`", f"`{key}.")) for line in lines) and plain:
-            continue  # another alternative of what was refused already
+            if fault["type"] == "string_type":  # another alternative of what was refused already
+                lines = [line.replace(f"`{key}` {_PLAIN['float_type']},", f"`{key}` {_EITHER},") for line in lines]
+            continue
         if plain and not fault["type"].startswith(("missing", "too")):
             got = repr(fault["input"])
             plain += f", got {got if len(got) <= _LONGEST else got[:_LONGEST] + '...'}"
         plain = plain or (message if message.startswith("must ") else "")
         line = f"`{key}` {plain}" if plain else f"`{key}`: {message[:1].lower()}{message[1:]}"
-        line = line if keys else line.removeprefix("``: ")
+        line = line if key else line.removeprefix("``: ")
         if line not in lines:
             lines.append(line)
     return ", and ".join(lines[:4]) + (", and more" if len(lines) > 4 else "") + "."
 
 
+def _words(key: str, fault: Any, faults: list[tuple[str, Any]]) -> str:
+    """What is wrong with a key, in the words of this program; "" where only the message says so."""
+    kind, own = fault["type"], [other["type"] for one, other in faults if one == key]
+    if kind == "list_type" and key in ("stay", "avoid", "reach"):
+        return f"must be a list of tables; write [[{key}]]"
+    if kind == "list_type" and key.split(".")[-2:-1] == ["box"]:
+        return "must be a pair [low, high], of which there is one for each state"
+    if kind == "dict_type" and "list_type" in own:
+        return f"{_PLAIN['list_type']}, or a table, such as {{ x = 0 }}"
+    return _PLAIN.get(kind, "").format(**fault.get("ctx", {}))
+
+
+def _key(fault: Any) -> str:
+    """Where a fault is, without pydantic's names of the alternatives of a union."""
+    return ".".join(str(part) for part in fault["loc"] if not (isinstance(part, str) and _is_machinery(part)))
+
+
+def _within(key: str, faults: list[tuple[str, Any]]) -> list[str]:
+    """The faulty keys below one."""
+    return [one for one, _ in faults if one.startswith(f"{key}.")]
+
+
+_EITHER = "must be a number or an expression in quotes"
 _LONGEST = 60
 _PLAIN = {
     "missing": "is missing",

@@ -100,6 +100,7 @@ def _constraint(constraint: Inside, curve: NominalPieces, system: System) -> Row
                 side, text = _side(region, a[index], index, system), label
                 if len(a) > 1:
                     named = region.kind != "box" or label != region.describe(system.states, constraint.word)
+                    named &= " <= " not in label  # a box that is stated in other coordinates is not named either
                     text = side if side and not named else f"{label}, side {index + 1}{side and f' ({side})'}"
                 yield text, rows, curve.least(rows, b[:, index])
 

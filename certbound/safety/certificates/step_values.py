@@ -61,9 +61,9 @@ def induction_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0, *,
     grids, pieces = _grids(problem, effort, steps)
     if pieces and effort == 0 and problem.horizon == steps:
         _check_pieces(problem, answer, lower)
-    plain = problem.reach is None and not problem.ending and steps == problem.horizon and not pieces
     ends = partial(_outward, problem, bool(pieces)) if lower else partial(_inward, problem)
-    jumps = _jumps(problem, grids[-1])
+    jumps = _jumps(problem, grids[-1])  # over which the checker counts the worst
+    plain = problem.reach is None and not problem.ending and steps == problem.horizon and not pieces and not any(jumps)
     if lower and problem.reach is not None and problem.reach.stays:  # what is not surely there is not valued by W
         for axis, face, _ in _faces(Inside(problem.reach.region), 0):
             jumps[axis].append(face)

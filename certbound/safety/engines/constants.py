@@ -66,6 +66,8 @@ SEGMENTS, SEGMENTS_BY_NAME = 48, 16
 """Pieces of local constants: the paper's window bounds take time that grows with their square."""
 SHARES = (1.15, 1.6, 2.4, 4.0)
 """Room tried with local constants, in units of the tube at the target probability."""
+_BURST = 1e3  # times the most room that the tube leaves at any time, by how much it is hopelessly wide elsewhere
+_ROUGH = 30.0  # times the room from which on what a tube takes says nothing of the problem
 _HAIR = 1e-3
 """Of the least room: what is left around the reach tube where no noise asks for any."""
 NEAR_MISS = 2.0
@@ -258,17 +260,25 @@ class _Work:
         if reach.end < self.flow.horizon:
             return replace(
                 held, time=reach.end, reach=reach,
-                reason=f"the reach tube could not be proved beyond t = {reach.end:.4g}; {self._narrower} a "
-                "smaller disturbance, or a shorter horizon.",
+                reason=f"the reach tube could not be proved beyond t = {reach.end:.4g}; {self._cure}.",
             )  # fmt: skip
         if erosion.broken():
+            most = np.max(erosion.least, initial=0.0, where=np.isfinite(erosion.least))
+            lost = bool(most > 0 and not -worst.margin < _BURST * most)
+            words = "is proved so widely only that it leaves" if lost else "already leaves"
+            short = "" if lost else f" (short by {-worst.margin:.3g})"
             return replace(
-                held,
-                reason=f"the noise-free reach tube already leaves no room for '{worst.label}' at "
-                f"{self._when(worst.time)} (short by {-worst.margin:.3g}); {self._narrower} a "
-                "smaller disturbance.",
+                answer if lost else held,
+                reason=f"the noise-free reach tube {words} no room for '{worst.label}' at "
+                f"{self._when(worst.time)}{short}; {self._cure}.",
             )
         return None
+
+    @property
+    def _cure(self) -> str:
+        """What makes the reach tube narrower: of what the problem has, and a shorter horizon."""
+        smaller = "a smaller disturbance, or " if self.problem.system.disturbance is not None else ""
+        return f"{self._narrower} {smaller}a shorter horizon"
 
     @property
     def _narrower(self) -> str:
@@ -312,9 +322,10 @@ class _Work:
             fits = level <= math.log10(target)
         worst = erosion.tightest(needed)
         place = worst.place | {"margin": max(worst.margin, 0.0) if fits else worst.margin}
+        rough = not fits and _taken(erosion, needed) > _ROUGH
         return replace(
             answer,
-            **place,
+            **({} if rough else place),
             log10_delta=level,
             reason=self._explained(erosion, needed, worst, level, fits),
             tube=tube,
@@ -331,11 +342,13 @@ class _Work:
         ratio = _taken(erosion, needed)
         if fits:
             return f"the tube takes {rounded(100 * ratio, up=True, digits=3)} % of the room that the constraints leave."
-        quieter = rounded(1 / ratio, up=False, digits=2)
         larger = f"delta >= {log10_text(level)}, or " if level < -0.01 else ""
+        cure = f"what would do: {larger}noise at most {rounded(1 / ratio, up=False, digits=2)} times as large."
+        if ratio > _ROUGH:
+            cure = "these constants are much too rough here, which says nothing of the problem itself."
         return (
             f"at delta = {self.problem.delta!r} the tube takes {ratio:.3g} times the room that '{worst.label}' leaves "
-            f"at {self._when(worst.time)}; what would do: {larger}noise at most {quieter} times as large."
+            f"at {self._when(worst.time)}; {cure}"
         )
 
 

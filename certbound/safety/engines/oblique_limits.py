@@ -33,7 +33,7 @@ from certbound.problem.sets import Faces, HalfSpace
 from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
 from certbound.safety.engines.rooms import log10_sum
-from certbound.safety.engines.turning import exact_product, logarithmic, scales_of, turned_problem
+from certbound.safety.engines.turning import exact_product, logarithmic, plainly, scales_of, turned_problem
 from certbound.watch import OutOfTime, seconds_left, share_of_time
 
 Prove = Callable[[Problem, Request], EngineAnswer]
@@ -127,7 +127,7 @@ def _asked_in(prove: Prove, problem: Problem, turn: Turn, asked: Request, plain:
     other = turned_problem(problem, *turn)
 
     def stated(answer: EngineAnswer) -> EngineAnswer:
-        reason = f"{answer.reason.rstrip('.')}; in the coordinates {_words(problem.system.states, turn[0])}."
+        reason = f"{answer.reason.rstrip('.')}; {_words(problem.system.states, turn[0])}."
         details = Turned(matrix=turn[0], inverse=turn[1], problem=other, answer=answer, plain=plain)
         return _instead(plain, answer, reason=reason, details=details)
 
@@ -315,12 +315,12 @@ def _noisy(problem: Problem, turn: Turn, place: int) -> bool:
 
 
 def _words(states: tuple[str, ...], matrix: Array) -> str:
-    """The states of y that are none of x."""
+    """The states of y that are none of x, or in which units they are."""
     rows = [row for row in matrix if np.count_nonzero(row) > 1]
-    if not rows:
-        units = [f"{float(f'{1 / row[k]:.1g}'):g} for {states[k]}" for k, row in enumerate(matrix)]
-        return f"that are multiples of about {', '.join(units)}"
-    return ", ".join(HalfSpace(row, 0.0).describe(states, "inside").partition(" <= ")[0] for row in rows)
+    if rows:
+        sums = (HalfSpace(row, 0).describe(states, "inside").partition(" <= ")[0] for row in rows)
+        return f"in the coordinates {', '.join(sums)}"
+    return "with " + ", ".join(f"{x} in units of about {1 / a:.1g}" for x, a in zip(states, np.diag(matrix)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -355,7 +355,7 @@ def by_logarithms(prove: Prove, *, again: bool = False) -> Prove:
             return replace(
                 plain, applicable=answer.applicable and answer.certified, log10_delta=answer.log10_delta, margin=None,
                 time=None, constraint=None, method=answer.method, foresight=False, conclusive=plain.conclusive,
-                reason=f"{answer.reason.rstrip('.')}; in the coordinates {names}.", details=details,
+                reason=f"{plainly(answer.reason).rstrip('.')}; in the coordinates {names}.", details=details,
             )  # fmt: skip
 
         earlier, old = (before.answer.details, before.plain.details) if before else (None, asked.before)

@@ -10,6 +10,7 @@ Ito's formula gives, and the same paths break x_i <= b and y_i <= log b. Limits 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -247,6 +248,14 @@ def logarithmic(problem: Problem, *, below: bool = False) -> tuple[tuple[int, ..
         )  # fmt: skip
     except ValueError as error:
         raise InfeasibleError(f"the problem is not stated in logarithms: {error}") from error
+
+
+def plainly(reason: str) -> str:
+    """Words about a problem in logarithms, its limits as those of the states themselves."""
+    return re.sub(
+        r"'log_(\w+) (<=|>=) ([-+.\de]+)'",
+        lambda side: f"'{side[1]} {side[2]} {math.exp(float(side[3])):.5g}'", reason,
+    )  # fmt: skip
 
 
 def _limited(problem: Problem) -> tuple[set[int], set[int]]:

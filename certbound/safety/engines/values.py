@@ -227,8 +227,9 @@ def _for_all(rate: tuple[float, float], before: tuple[int, float, float]) -> str
     """What is known of every horizon."""
     low, high = rounded(rate[0], up=False, digits=4), rounded(rate[1], up=True, digits=4)
     least, most = rounded(before[1], up=False, digits=4), rounded(before[2], up=True, digits=4)
+    below = f"1 - {_power(least, low, before[0])}" if rate[0] > 0 else least
     return (
-        f"For every T from {before[0]}: 1 - {_power(least, low, before[0])} <= P(leaving within T steps) <= "
+        f"For every T from {before[0]}: {below} <= P(leaving within T steps) <= "
         f"1 - {_power(most, high, before[0])}"
     )
 

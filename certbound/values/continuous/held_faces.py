@@ -84,8 +84,9 @@ def check_noise(
             low, high = np.hstack([low, low]), np.hstack([high, high])
             high[axis, : len(middle)], low[axis, len(middle) :] = middle, middle
     raise InfeasibleError(
-        "value functions in continuous time need noise of full rank everywhere in the safe set; here some "
-        "direction has none somewhere (noise in the velocities only, say), and value functions prove nothing."
+        "value functions in continuous time need noise of full rank everywhere in the safe set, that is in every "
+        "direction; here some direction has none somewhere (noise in the velocities only, say, or noise that vanishes "
+        "with a state), and value functions prove nothing."
     )
 
 

@@ -389,9 +389,9 @@ class Work:
         return upper, float(values[inside].max()) if inside.any() else 0.0
 
     def _highest(self, transition: AnyTransition, above: Parts, meets: Mask) -> float:
-        nodal, bend, known = values_above(transition, *above)
+        nodal, bend, known, level = values_above(transition, *above)
         top = np.maximum.reduce(corners(nodal))
         for i in range(self.n):
             top = top + np.maximum(-bend[i], 0.0) * transition.step.grid.widths(i) ** 2 / 8 * (1 + 1e-12)
-        top = np.where(known, top, 1.0).ravel()[meets]
+        top = np.where(known, top, level).ravel()[meets]
         return float(top.max())

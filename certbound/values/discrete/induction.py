@@ -4,7 +4,8 @@ With V_t(x) the largest probability, over the disturbances, of failing from x at
     V_T = 1 off S_T and 0 on it,  V_t = 1 off S_t,  V_t(x) = sup_d E V_{t+1}(f(t, x, d) + G w) on S_t.
 Above: U_t is 1 outside the grid and on every cell that is not surely safe, and at least sup_d phi elsewhere; below: the
 grid contains S_t, U_t is 1 on cells that are surely unsafe, and at most phi for one disturbance a cell elsewhere (V_t
-is at least that everywhere). A target G_t that ends the danger puts 0 on its cells, and 1 on the others at step T.
+is at least that everywhere). Over cells on which f may jump U_t is a constant that does so (`_across`). A target G_t
+that ends the danger puts 0 on its cells, and 1 on the others at step T.
 
 A target that must be stayed in: W_t, the probability of failing of who has arrived, comes by the same induction with
 every step off G_t unsafe, and V_t = W_t on G_t, W_t >= V_t elsewhere. V_{t+1} jumps there, so that it is given as a sum
@@ -13,6 +14,7 @@ of two functions, each 0 on the other's cells; means are sums, and so are their 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +26,7 @@ from certbound.problem.sets import Inside, Region
 from certbound.values.discrete.cubic import CubicTransition
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.scaled import ScaledTransition
-from certbound.values.discrete.transitions import Transition
+from certbound.values.discrete.transitions import Transition, Windows
 from certbound.values.discrete.uniform_noise import UniformTransition
 from certbound.values.grids import Grid, around_nodes, corners
 from certbound.values.sets import contains, respected
@@ -84,30 +86,33 @@ def back_above(transition: AnyTransition, value: ValueFunction, zones: Zones, *m
     if isinstance(transition, CubicTransition):
         return transition.back(value, above=True)
     grid = transition.step.grid
-    nodal, bend, known = values_above(transition, value, *more)
-    fixed = ~zones.safe | ~known
-    level = np.ones(grid.shape)
+    nodal, bend, known, level = values_above(transition, value, *more)
+    fixed, level = ~zones.safe | ~known, np.where(zones.safe, level, 1.0)
     if zones.has_target:
         ended = zones.done & zones.safe
         fixed, level = fixed | ended, np.where(ended, 0.0, level)
     return assembled(grid, nodal, bend, fixed, level, value.beyond)
 
 
-def values_above(transition: AnyTransition, *values: ValueFunction) -> tuple[Array, Array, Mask]:
-    """Node values, bends and the cells on which they lie above sup_d phi, phi the mean of the sum of some functions."""
+def values_above(transition: AnyTransition, *values: ValueFunction) -> tuple[Array, Array, Mask, Array]:
+    """Node values, bends and the cells on which they lie above sup_d phi, phi the mean of the sum of some functions.
+
+    Last a constant on every cell that is at least min(sup_d phi, 1) on all others.
+    """
     most: list[Array] = []
-    bend, bump, known = np.zeros(1), np.zeros(1), np.ones(1, dtype=bool)
+    bend, bump, known, level = np.zeros(1), np.zeros(1), np.ones(1, dtype=bool), np.zeros(1)
     for value in values:
         field: Any = transition.tables.field(value)
         each = [at + error for at, error in transition.at_nodes(field)]
         most = [a + b for a, b in zip(most, each, strict=True)] if most else each
         more, raised, sure = _bends(transition, field, above=True)
         bend, bump, known = bend + more, bump + raised, known & sure
+        level = level + _across(transition, field, above=True)
     nodal = np.maximum.reduce(most) + bump
     if len(values) > 1:
         nodal, bend = nodal + _SUM * np.abs(nodal), bend - _SUM * np.abs(bend)
     nodal, holes = _without_holes(nodal, 1.0)
-    return nodal, bend, known & ~holes
+    return nodal, bend, known & ~holes, np.clip(level + _SUM * np.abs(level), 0.0, 1.0)
 
 
 def nodes_below(transition: AnyTransition, *values: ValueFunction, **options: Any) -> list[Array]:
@@ -136,7 +141,8 @@ def back_below(transition: AnyTransition, value: ValueFunction, zones: Zones, *m
     bend = bend + _SUM * np.abs(bend) if more else bend
     nodal, holes = _without_holes(nodal, 0.0)
     fixed = zones.unsafe | ~known | holes
-    level = np.where(zones.unsafe, 1.0, 0.0)
+    least = np.sum([_across(transition, field, above=False) for field in fields], axis=0)
+    level = np.where(zones.unsafe, 1.0, np.clip(least - _SUM * np.abs(least), 0.0, 1.0))
     if zones.has_target:
         maybe = ~zones.undone & ~zones.unsafe
         fixed, level = fixed | maybe, np.where(maybe, 0.0, level)
@@ -184,6 +190,27 @@ def _bends(transition: AnyTransition, field: Any, *, above: bool) -> tuple[Array
             raised = np.maximum(raised, np.reshape(more, grid.shape) * (1 + 1e-12))
         bump = around_nodes(raised, largest=False)
     return np.where(known, bend, 0.0), bump, known
+
+
+def _across(transition: AnyTransition, field: Any, *, above: bool) -> Array:
+    """A constant above (below) sup_d phi on every cell over which f may jump, or has no slope; else 1 (0).
+
+    On such a cell phi lies between the least and the largest h over the range of f there, which holds both sides of a
+    jump and all that lies between them; from below one box of disturbances is enough. Nothing is known of h beyond the
+    mesh.
+    """
+    grid, cells, unknown = transition.step.grid, transition.step.cells, 1.0 if above else 0.0
+    rough = np.flatnonzero(~np.all([images.steady for images in cells], axis=0))
+    level = np.full(math.prod(grid.shape), unknown)
+    if len(rough) and not isinstance(transition, ScaledTransition | CubicTransition):
+        mesh, (low, high) = transition.tables.mesh, transition.ranges(field)
+        last, found = mesh.start + mesh.step * (np.array(mesh.count) - 1), []
+        for images in (images.ranges_of(rough) for images in cells):
+            ends = Windows(images, transition.tables).extreme(high if above else low, largest=above)
+            inside = np.all((images.image.lo >= mesh.start) & (images.image.hi <= last), axis=1)
+            found.append(np.where(images.defined & inside & np.isfinite(ends), ends, unknown))
+        level[rough] = np.maximum.reduce(found)
+    return level.reshape(grid.shape)
 
 
 def _without_holes(nodal: Array, filling: float) -> tuple[Array, Mask]:

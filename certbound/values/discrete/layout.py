@@ -22,12 +22,11 @@ from certbound.values.grids import Grid, graded_axis
 from certbound.values.sets import active_at, box_around
 
 _COARSE = {1: 256, 2: 32, 3: 12}  # cells along each side when the reach of a step is bounded
-
-
 _MOST_PLACES = 1e7  # along an axis
 _PATHS = 400
 _PAST = 6.0  # sizes of normal noise beyond a limit that most paths which break it keep to
 _SMALLER = 0.9  # times the boxes that states surely keep to, below which boxes that end before are taken
+_GROWTHS, _MOST_GROWN = 40, 1e4  # of a box that is to last: how often it grows, and by how many sizes of the noise
 _BEYOND, _FARTHER = 0.6, 15.0  # how far beyond simulated paths space is cut: of their extent, and sizes of the noise
 
 
@@ -160,6 +159,28 @@ def _check_box(problem: Problem, low: Array, high: Array, t: int, spread: Array)
             )
         if not low[i] < high[i]:
             raise Inapplicable(f"value functions need a safe set with an interior, and `{name}` has none at step {t}.")
+
+
+def lasting_box(problem: Problem, shocks: Shocks, dynamics: Dynamics) -> tuple[Array, Array] | None:
+    """A box around the starts that states within the limits of step 0 do not leave, but for the tails of one step.
+
+    Of a model that is the same at every step; None where none was found, or the noise depends on the state.
+    """
+    if shocks.sizes is not None or shocks.laplace:
+        return None
+    low, high = box_around(active_at(problem.constraints, 0), dynamics.n, 0)
+    spread = max(REACH, shocks.reach) * (np.sqrt(shocks.sigma.hi**2 + shocks.factor.mag**2) * (1 + 1e-12))
+    start, free = start_box(problem), (np.isinf(low), np.isinf(high))
+    first, last = np.where(free[0], start[0], low), np.where(free[1], start[1], high)
+    for more in 1.2 * 2 ** np.linspace(0, 10, _GROWTHS):  # a limit that is approached is passed at last
+        below, above = _next_reach(dynamics, 0, low, high, (first, last), spread)
+        grown = free[0] * np.maximum(first - below, 0.0), free[1] * np.maximum(above - last, 0.0)
+        if not np.any(grown):
+            return first, last
+        if not np.all(np.sum(grown, axis=0) < _MOST_GROWN * spread):
+            return None
+        first, last = first - more * grown[0] - 1e-9 * spread, last + more * grown[1] + 1e-9 * spread
+    return None
 
 
 def _next_reach(

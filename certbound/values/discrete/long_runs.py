@@ -32,7 +32,7 @@ from certbound.values.discrete.failures import Work
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.induction import AnyTransition, Zones, assembled, back_above, back_below, final
 from certbound.values.discrete.kernels import REACH
-from certbound.values.discrete.layout import FailureBounds, shares_of, start_box
+from certbound.values.discrete.layout import FailureBounds, lasting_box, shares_of, start_box
 from certbound.values.discrete.scaled import dynamics_of
 from certbound.values.discrete.shocks import Inapplicable
 from certbound.values.grids import Grid, over_corners
@@ -113,6 +113,8 @@ def bound_long_run(
             break
     if best is None:
         raise Inapplicable(run.work.too_large)
+    if run.leak and best.rate is not None:  # what is paid once a step below is not part of the rate
+        best = replace(best, rate=(0.0, best.rate[1]))
     return replace(best, seconds=time.perf_counter() - begun, tried=tuple(tried))
 
 
@@ -197,6 +199,8 @@ class _Run:
         plain = _bounded(problem, parts)
         self.work = Work(plain, self.target, parts)
         self.leak = 0.0 if self.target is None else 2 * self.work.n * tail(REACH)
+        if self.target is None and (self.work.boxes.leak > 0 or self.work.boxes.cut) and math.isfinite(self.horizon):
+            self._last(plain, parts)
         if self.work.boxes.leak > 0 or (self.work.boxes.cut and math.isinf(self.horizon)):
             raise Inapplicable(
                 "value functions of long horizons need limits on both sides of every state: add a constraint or a "
@@ -204,6 +208,19 @@ class _Run:
             )
         self.first = 0 if self.work.random else 1
         self.steps, self.ended = 0, False  # whether time ended a grid, of which the last bounds hold
+
+    def _last(self, plain: Problem, parts: int) -> None:
+        """Bound states without limits by a box that paths do not leave, but for tails: above who leaves it has failed.
+
+        Below that is paid for once a step.
+        """
+        box = lasting_box(plain, self.work.shocks, self.work.dynamics)
+        if box is None:
+            return
+        low, high = box_around(plain.constraints, self.work.n, 0)
+        sides = np.where(np.isinf(low), box[0], -np.inf), np.where(np.isinf(high), box[1], np.inf)
+        self.work = Work(plain.replace(safe=[*plain.safe, Inside(Box(*sides))]), None, parts)
+        self.leak = 2 * self.work.n * tail(REACH)
 
     def bounds(
         self, grid: Grid, share: float, ratio: float, most: float, brief: tuple[float, float]
@@ -261,6 +278,7 @@ class _Run:
         before = (n + self.first, lower if rate is not None and rate[0] > 0 else max(lower, 0.0), upper)
         if rate is not None:
             upper, lower = later(upper, rate[1], more, up=True), later(lower, rate[0], more, up=False)
+            lower -= self.horizon * self.leak * (1 + 1e-9) if self.leak else 0.0
         lower = min(max(lower, 0.0), 1.0)
         return FailureBounds(
             upper=upper, lower=lower, cells=pair[0].grid.shape, share=share, seconds=0.0, tried=(), rate=rate,

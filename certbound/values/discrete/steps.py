@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from certbound.arrays import Array, Mask
+from certbound.arrays import Array, Integers, Mask
 from certbound.problem.model import Tape, enclosed, jacobian, jumps_where, undefined_where
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
@@ -37,6 +37,13 @@ class CellImages:
     defined: Mask
     steady: Mask
     smooth: Mask
+
+    def ranges_of(self, cells: Integers) -> CellImages:
+        """Some cells alone, of which nothing but the range is told: steady wherever f is defined."""
+        defined, parts = self.defined[cells], (self.image[cells], self.slopes[cells], self.bends[cells])
+        return CellImages(
+            image=parts[0], slopes=parts[1], bends=parts[2], defined=defined, steady=defined, smooth=defined & False
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -217,15 +224,31 @@ def evaluate(tape: Tape, inputs: list[Interval]) -> tuple[Interval, Mask, Mask]:
 
 def _run(tape: Tape, inputs: list[Interval], undefined: Mask, jumps: Mask) -> list[Interval]:
     values: list[Interval] = []
-    for node in tape.nodes:
+    chosen = _choices(tape)
+    for index, node in enumerate(tape.nodes):
         if node.op == "input":
             values.append(inputs[node.args[0]])
             continue
         args = [values[arg] for arg in node.args]
         value = enclosed(node, args)
+        if index in chosen:
+            x, y = (values[arg] for arg in chosen[index])
+            value = Interval(np.fmax(value.lo, np.minimum(x.lo, y.lo)), np.fmin(value.hi, np.maximum(x.hi, y.hi)))
         if (jump := jumps_where(node, value, args)) is not None:
             np.logical_or(jumps, jump, out=jumps)
         elif (mask := undefined_where(node, args)) is not None:
             np.logical_or(undefined, mask, out=undefined)
         values.append(value)
     return values
+
+
+def _choices(tape: Tape) -> dict[int, tuple[int, int]]:
+    """The sums that are ``where(c, x, y)`` as it is traced, with the nodes x and y: their value is one of both."""
+    nodes, found = tape.nodes, {}
+    for index, node in enumerate(nodes):
+        if node.op != "add" or any(nodes[arg].op != "if_else_zero" for arg in node.args):
+            continue
+        (c, x), (d, y) = (nodes[arg].args for arg in node.args)
+        if any(nodes[one].op == "not" and nodes[one].args == (other,) for one, other in ((c, d), (d, c))):
+            found[index] = x, y
+    return found

@@ -212,7 +212,11 @@ class Transition:
             found.append((value.reshape(shape), error.reshape(shape)))
         return found
 
-    # ---- second derivatives over cells -----------------------------------------------------------------------
+    # ---- over cells ------------------------------------------------------------------------------------------
+
+    def ranges(self, field: Field) -> tuple[Array, Array]:
+        """The least and the largest h over the mesh's cells."""
+        return self._over_mesh(field, [((0,) * self.n, _ONE)], over_corners(np.maximum, field.dominant))
 
     def bends(self, field: Field, variables: range, *, above: bool) -> list[list[Array]]:
         """Per box of disturbances and variable: the least (else largest) second derivative of phi over every cell.

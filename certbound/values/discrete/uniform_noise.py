@@ -36,7 +36,7 @@ from certbound.values.discrete.kernels import AxisKernel, Block
 from certbound.values.discrete.shocks import Inapplicable, Shocks
 from certbound.values.discrete.steps import Step
 from certbound.values.discrete.transitions import Places, Transition
-from certbound.values.grids import Grid
+from certbound.values.grids import Grid, over_corners
 
 _UNIT = 2.0**-53
 _MOST_WEIGHTS = 8_000_000
@@ -182,20 +182,29 @@ class UniformTransition:
 
     def at_nodes(self, field: UniformField) -> list[tuple[Array, Array]]:
         """Per vertex of the disturbances: phi at the nodes, and a bound of its error (inf where f is undefined)."""
-        missing = sum(
-            (high - low) * float(field.mesh.step[i]) / 4 * (1 + 1e-9) for i, (low, high) in enumerate(field.slopes)
-        )
+        missing = self._missing(field)
         steepest = [float(max(np.abs(low).max(), np.abs(high).max())) for low, high in field.slopes]
         cells = tuple(count - 1 for count in field.mesh.count)
         found = []
         for places in self.places:
-            error = np.asarray(missing).ravel().take(places.flat(cells, (0,) * self.n)) + 2 * field.error
+            error = missing.ravel().take(places.flat(cells, (0,) * self.n)) + 2 * field.error
             for i in range(self.n):
                 error = error + places.radius[:, i] * steepest[i]
             error = np.where(places.usable, error * (1 + 1e-9), np.inf)
             shape = self.step.grid.node_shape
             found.append((places.interpolate(field.table).reshape(shape), error.reshape(shape)))
         return found
+
+    @staticmethod
+    def _missing(field: UniformField) -> Array:
+        """Over the mesh's cells, how far h may be from its interpolation."""
+        ranges = enumerate(field.slopes)
+        return np.asarray(sum((high - low) * float(field.mesh.step[i]) / 4 * (1 + 1e-9) for i, (low, high) in ranges))
+
+    def ranges(self, field: UniformField) -> tuple[Array, Array]:
+        """The least and the largest h over the mesh's cells."""
+        slack = (self._missing(field) + 2 * field.error) * (1 + 1e-9)
+        return over_corners(np.minimum, field.table) - slack, over_corners(np.maximum, field.table) + slack
 
     def bends(self, field: UniformField, variables: range, *, above: bool) -> list[list[Array]]:
         """Per box of disturbances and variable: -+2 (range of phi's slope)/width over every cell."""

@@ -90,7 +90,7 @@ def test_a_thousand_chained_definitions_are_read():
         ("horizon = 5.0", "horizon = -5", "`horizon` must be positive, got -5"),
         ("horizon = 5.0", "horizon = true", "`horizon` must be a number or an expression, got true"),
         ("horizon = 5.0", "horizon = nan", "`horizon` must be a number, got nan"),
-        ("horizon = 5.0", "horizon = [1, 2]", r"`horizon` must be a number, got \[1, 2\]"),
+        ("horizon = 5.0", "horizon = [1, 2]", r"`horizon` must be a number or an expression in quotes, got \[1, 2\]"),
         ("horizon = 5.0", 'horizon = "5"', "`horizon` must be a number, got the text '5'; write it without quotes"),
         ("during = [0, 2]", 'during = ["0", "2"]', r"`avoid\.0\.during\.0` must be a number, got the text '0'"),
         ("v = 1.0", 'v = "1.0"', r"`parameters\.v` must be a number, got the text '1\.0'"),
@@ -126,6 +126,9 @@ def test_a_thousand_chained_definitions_are_read():
         ("[noise]\ndiffusion = ", "[noise]\nlaw = 'gaussian'\nstd = 1\nq = ", "unknown key 'q' in \\[noise\\]"),
         ("[noise]\n", "[noise]\nlaw = 'gaussian'\n", "`noise` must hold `diffusion` alone in continuous time"),
         ("[-0.1, 0.1], [-0.1, 0.1], [-0.1, 0.1]]", "[-0.1, 0.1]]", r"`initial\.box` must have 3 entries, got 1"),
+        ("box = [[-0.1, 0.1], [-0.1, 0.1]", "box = [[-0.1, 0.1], 0.1", r"wrong: `initial\.box\.1` must be a pair"),
+        ("[initial]\nbox", '[initial]\npoint = "origin" #', "`initial.point` must be a list, .* or a table, "),
+        ("[initial]\nbox", "[initial]\npoint = [0, true, 0] #", r"wrong: `initial\.point\.1` must be a number"),
         ("box = [[-0.1, 0.1]", "boxx = [[-0.1, 0.1]", "unknown key 'boxx' in \\[initial\\]; did you mean 'box'"),
         ("[initial]\nbox", "[initial]\npoint = [0, 0, 0]\nbox", r"\[initial\] needs exactly one of .*'point', 'box'"),
         (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from statistics import NormalDist
 from typing import Any
@@ -111,6 +112,7 @@ def test_constant_noise_in_logarithms_is_no_leave_to_foresee() -> None:
     assert isinstance(answer.details, Logarithmic)
     assert not answer.foresight
     assert "in the coordinates log p, log q" in answer.reason
+    assert re.search("the largest part of that probability is .* for '[pq] [<>]= (0.5|2)'", answer.reason)
     report = check_data(json.loads(certificate_text(problem, verdict_of(problem, {"linear": answer}))))
     assert report.valid
     assert "does not see coming noise" in report.claim

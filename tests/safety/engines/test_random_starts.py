@@ -69,3 +69,21 @@ def test_where_disturbances_leave_no_room_a_random_start_is_told_so() -> None:
     reason = cb.verify_safety(problem, method="constants").reason
     assert "already leaves no room" in reason
     assert "; try a smaller disturbance" in reason
+
+
+def test_what_cannot_be_smaller_is_not_asked_to_be() -> None:
+    """A neuron at rest: one start, no disturbance; a tube that bursts was told 'short by 4.43e+13'."""
+    system = cb.ContinuousSystem(
+        lambda v, w: [v - v**3 / 3 - w + 0.2, 0.08 * (v + 0.7 - 0.8 * w)], states=["v", "w"], diffusion=[[0.04], [0]]
+    )
+    problem = cb.Problem(
+        system, initial=[-1.0694, -0.4617], safe=[cb.Inside(cb.HalfSpace([1.0, 0.0], 0.0))], horizon=20.0, delta=0.05
+    )
+    verdict = cb.verify_safety(problem, method="constants")
+    assert verdict.margin is None  # -1e9 says nothing
+    assert "much too rough here, which says nothing of the problem" in verdict.reason
+    assert "noise at most" not in verdict.reason
+    verdict = cb.verify_safety(problem.replace(horizon=50.0), method="constants")
+    assert verdict.margin is None
+    burst = verdict.reason
+    assert "is proved so widely only that it leaves no room for 'v <= 0' at t = 50; try a shorter horizon." in burst

@@ -338,3 +338,57 @@ def test_boxes_of_long_horizons_cost_in_proportion(monkeypatch: pytest.MonkeyPat
     problem = scalar(horizon=40, noise=cb.Gaussian(std=0.1))
     assert bound_failure(problem, seconds=0.01).upper < 1
     assert asked == list(range(41))
+
+
+def _kept(f: Any, std: float, safe: tuple[float, float], start: float, steps: int) -> float:
+    """P(leaving) of x+ = f(x) + std w by the midpoint rule on 1500 cells."""
+    edges = np.linspace(*safe, 1501)
+    middles = np.append((edges[1:] + edges[:-1]) / 2, start)
+    step = np.diff(norm.cdf((edges[None] - f(middles)[:, None]) / std), axis=1)
+    left = np.ones(1500)
+    for _ in range(steps - 1):
+        left = step[:-1] @ left
+    return float(1 - step[-1] @ left)
+
+
+@pytest.mark.parametrize(
+    ("f", "std", "safe", "start", "ratio"),
+    [
+        (lambda x: x + 0.1 * (10 - x) + np.where(x < 20, 1.8, 0.0), 0.3, (18.6, 21.2), 20.1, 1.02),  # a thermostat
+        (lambda x: np.where(x < 40, 100.0, x) - 10, 4.0, (16.0, 120.0), 100.0, 1.4),  # a stock that is filled up
+    ],
+)
+def test_over_a_jump_what_both_sides_of_it_lead_to_counts(
+    f: Any, std: float, safe: tuple[float, float], start: float, ratio: float
+) -> None:
+    limits, law = [cb.Inside(cb.Box([safe[0]], [safe[1]]))], cb.Gaussian(std=std)
+    found = bound_failure(scalar(lambda x: f(x[0]), noise=law, safe=limits, initial=[start], horizon=20), ratio=1.01)
+    exact = _kept(f, std, safe, start, 20)
+    assert found.lower <= exact * 1.001  # of the midpoint rule
+    assert exact * 0.999 <= found.upper
+    assert found.upper <= ratio * exact <= ratio**2 * found.lower
+
+
+def test_uniform_noise_over_a_jump() -> None:
+    worn = cb.DiscreteSystem(
+        lambda x: np.where(x[0] > 8, 0.0, x[0]) + 0.5, states=["wear"], noise=cb.Uniform(halfwidth=0.5)
+    )
+    problem = cb.Problem(worn, initial=[7.0], safe=[cb.Inside(cb.Box([-1], [9.1]))], horizon=6)
+    assert bound_failure(problem, delta=1e-2).upper <= 1e-2  # 0: more than 8 is replaced, and at most 1 is added
+    tight = problem.replace(safe=[cb.Inside(cb.Box([-1], [8.6]))])
+    found, (low, high) = bound_failure(tight, ratio=1.3), limits(tight, 20_000, 3)
+    assert found.lower <= high
+    assert found.upper >= low
+    assert found.upper <= 1.3 * found.lower
+
+
+def test_disturbances_over_a_jump() -> None:
+    pushed = scalar(
+        lambda x, d: np.where(x[0] + d[0] > 0.3, -0.4, x[0]) + d[0], noise=cb.Gaussian(std=0.1), horizon=6,
+        disturbance=cb.Box([-0.1], [0.1]), initial=[0.0], safe=[cb.Inside(cb.Box([-0.8], [0.55]))],
+    )  # fmt: skip
+    found = bound_failure(pushed)
+    for policy in (lambda t, x: [np.full(len(x), 0.1)], lambda t, x: [np.where(x[:, 0] > 0, -0.1, 0.1)],
+                   lambda t, x: [np.where(x[:, 0] > 0.1, 0.1 * (x[:, 0] < 0.2), 0.1)]):  # fmt: skip
+        assert found.upper >= limits(pushed, 20_000, 4, policy)[0]
+    assert 0 < found.lower < found.upper < 0.9

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 
 import certbound as cb
 from certbound.errors import InfeasibleError
-from certbound.values.discrete import bound_failure, bound_long_run, failures, long_runs
+from certbound.values.discrete import bound_failure, bound_long_run, failures, layout, long_runs
 from certbound.values.discrete.functions import ValueFunction
 from certbound.values.discrete.long_runs import largest_rate, least_rate
 from certbound.values.grids import Grid
@@ -219,3 +219,33 @@ def test_an_end_is_asked_for_where_it_is_needed():
         contraction(horizon=math.inf, safe=[cb.Inside(cb.Box([-1], [1]), during=(0, 5))])
     with pytest.raises(InfeasibleError, match="at most 100000 steps"):
         bound_failure(contraction(horizon=10**9))
+
+
+def cusum(step=lambda s: np.maximum(s, 0.0) - 0.5, **options):
+    system = cb.DiscreteSystem(step, states=["s"], noise=cb.Gaussian(std=1.0))
+    given = {"initial": [0.0], "safe": [cb.Inside(cb.Box([-np.inf], [5]))], "horizon": 500}
+    return cb.Problem(system, **given | options)
+
+
+def lasting(problem):
+    work = failures.Work(problem, None, 4)
+    return layout.lasting_box(problem, work.shocks, work.dynamics)
+
+
+@pytest.mark.parametrize("horizon", [500, 3000])
+def test_a_side_that_steps_hardly_pass_needs_no_limit(horizon):
+    found = bound_long_run(cusum(horizon=horizon), seconds=1, ratio=1.1)
+    truth = 1 - staying(lambda s: np.maximum(s, 0.0) - 0.5, 1.0, horizon, 0.0, low=-10.5, high=5.0)
+    assert found.lower <= truth <= found.upper <= 1.2 * found.lower
+    assert found.rate[0] == 0  # of other horizons nothing is said from below but what 500 steps say
+
+
+def test_a_box_that_lasts_holds_what_steps_lead_to():
+    (low,), (high,) = lasting(cusum(horizon=1))
+    assert -20 < low <= -0.5 - 10
+    assert high == pytest.approx(5)  # the limit
+    (low,), _ = lasting(cusum(lambda s: np.where(s > 3, -40.0, 0.0), horizon=1, initial=cb.Box([-30], [0])))
+    assert low <= -50  # from above the starts
+    (low,), _ = lasting(cusum(lambda s: 0.9 * s, horizon=1))
+    assert low <= 0.9 * low - 10
+    assert lasting(cusum(lambda s: 1.1 * s, horizon=1)) is None

@@ -182,8 +182,8 @@ def _refuse_noiseless(squares: Squares, region: Region, horizon: float) -> None:
         raise InfeasibleError("the noise has no finite size somewhere in the safe set; value functions prove nothing.")
     if np.all(a[0, 0] * a[1, 1] - a[0, 1] ** 2 <= _RANK * (a[0, 0] + a[1, 1]) ** 2):
         raise InfeasibleError(
-            "value functions within curved limits or among obstacles need noise of full rank; here some direction has "
-            "none (noise in the velocities only, say), and value functions prove nothing."
+            "value functions within curved limits or among obstacles need noise of full rank, that is in every "
+            "direction; here some has none (noise in the velocities only, say), and value functions prove nothing."
         )
 
 
