@@ -102,6 +102,8 @@ def _target(rng: Random, draft: Draft, times: Array, states: Array) -> Wall:
     spread = np.std(states[k], axis=0) + 1e-3
     center = states[k].mean(axis=0) + spread * rng.normal(size=draft.dimension) * rng.choice([0.3, 1.5])
     during = _window(rng, draft, times)
+    if during == (0.0, 0.0):  # of a start nothing is left to be asked
+        during = None
     if rng.random() < 0.3:
         shape = Shape(kind="ball", data=(float(2.0 * spread.max() * rng.uniform(0.5, 2.0)),), center=tuple(
             number(float(c)) for c in center

@@ -167,6 +167,7 @@ class Solver:
         """V and its rate on the faces."""
         return 0.0, 0.0
 
+    @np.errstate(over="ignore", invalid="ignore")  # a proposal that breaks down is no number, and is left
     def _right(self, tau: float, value: Array) -> tuple[Array, Array, Array, Array]:
         drift, a = self.fixed or self._model(self.plane.horizon - tau)
         vx, vy = self.slope[0] @ value, value @ self.slope[1].T
