@@ -151,6 +151,7 @@ WRONG = [("noise", 1e-6), ("noise", 1e-2), ("scaled", -0.05), ("scaled", 0.05), 
          ("steep", 0.05)]  # fmt: skip
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(("name", "tries"), [
     ("a random start", WRONG), pytest.param("a window that begins late", WRONG[1:4], marks=pytest.mark.slow),
 ])
