@@ -312,6 +312,7 @@ def test_the_order_of_the_patches_does_not_matter() -> None:
 WELL = (lambda x: [x[0] - x[0] ** 3], 0.35, 0.0, 2.5, 10.0, (0.9, 1.1))
 
 
+@pytest.mark.usefixtures("lighter")
 @pytest.mark.parametrize(
     ("f", "g", "low", "high", "horizon", "start"),
     [
@@ -454,6 +455,7 @@ def two_free_states() -> cb.Problem:
 TWO_FREE_STATES = math.log10(1 - (1 - exit_probability(lambda t, x: -x, lambda t, x: 0.5 + 0 * x, -1, 1, 1, 0.0)) ** 2)
 
 
+@pytest.mark.usefixtures("frugal")
 def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
     found = bound_exits(two_free_states(), seconds=0.01, delta=0.5)
     assert TWO_FREE_STATES <= found.upper < TWO_FREE_STATES + 0.16
