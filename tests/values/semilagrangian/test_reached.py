@@ -117,8 +117,8 @@ def test_where_the_model_changes_with_time_what_steps_share_is_made_for_their_en
         lambda t, x: [x[1], -3 * x[0] - 0.3 * x[1] + 0.3 * np.cos(2 * t)], states=2, diffusion=[[0.0], [0.25]]
     )
     safe = [cb.Inside(cb.Box([-1, -2], [1, 2]))]
-    one = setting_of(cb.Problem(system, initial=[0.6, 0], safe=safe, horizon=0.45))
-    plan = replace(PLAN, count=3)
+    one = setting_of(cb.Problem(system, initial=[0.6, 0], safe=safe, horizon=0.75))
+    plan = replace(PLAN, count=5)
     scout = leaving.scout_of(one)
     upper, lower = leaving.bounds_by_steps(one, plan, scout=scout)
     monkeypatch.setattr(leaving, "_reached", lambda *asked: None)
