@@ -62,7 +62,7 @@ def test_a_population_that_dies_out_is_bounded_from_both_sides() -> None:
     assert 0.03 < 10**found.lower <= 10**found.upper < min(0.25, 1.15 * 10**found.lower)
 
 
-@pytest.mark.usefixtures("coarse")
+@pytest.mark.usefixtures("frugal")
 @pytest.mark.parametrize("gone", [cb.HalfSpace([1], 0), cb.Box([-1], [0])])
 def test_who_is_to_keep_off_a_face_that_no_path_crosses_fails_as_he_touches_it(gone) -> None:
     """dx = sqrt(x) dW from 1/2 has died out by 2 with probability exp(-1/2); a path stays in x >= 0 for ever."""
