@@ -12,7 +12,6 @@ from certbound.checker import check_data
 from certbound.problem.files.loading import loads
 from certbound.rigor.intervals import Interval
 from certbound.safety.certificate import certificate_text
-from certbound.safety.engines import values
 from certbound.values.sets import active_at, box_around, contains, respected
 
 REGIONS = [
@@ -96,9 +95,8 @@ box = { gut = [0.3, 2.5], blood = [0.4, 4] }
 """
 
 
-def test_a_level_that_is_to_be_avoided_is_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_level_that_is_to_be_avoided_is_a_limit() -> None:
     """Simulated .0067; as a curved wall the limit left .30 after 52 s, of .015 over a horizon of 2."""
-    monkeypatch.setattr(values, "_SECONDS", 2.0)
     problem = loads(LEVEL)
     verdict = cb.verify_safety(problem, method="values", time_limit=60)
     assert verdict.status == "SAFE"
