@@ -129,10 +129,18 @@ def test_splitting_goes_on_from_a_checkpoint_too(tmp_path):
 
 SCRIPT = """
 import sys
+import time
 import certbound as cb
 from certbound.simulation import executors
+from certbound.simulation.checkpoint import Checkpoint
 from certbound.simulation.estimates import simulate_exits
 executors._SAVE_EVERY = 0.0
+save = Checkpoint.save
+def saved(record):
+    if record.done.sum() > 8:
+        save(record)
+        time.sleep(60.0)
+Checkpoint.save = saved
 system = cb.ContinuousSystem(lambda x: -0.5 * x, states=1, diffusion=[[0.1**0.5]])
 problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Ball([0.0], 0.8))], horizon=5.0)
 result = simulate_exits(problem, paths={paths}, rng=5, steps={steps}, checkpoint=sys.argv[1])
@@ -141,8 +149,9 @@ print(result.exits)
 
 
 def test_a_run_that_was_killed_goes_on(tmp_path):
+    """It is killed after its first save, in which there is a part of the paths."""
     path = tmp_path / "run.npz"
-    paths, steps = 300_000, 200
+    paths, steps = 20_000, 200
     script = SCRIPT.format(paths=paths, steps=steps)
     process = subprocess.Popen([sys.executable, "-c", script, str(path)])
     deadline = time.monotonic() + 60

@@ -71,7 +71,7 @@ def test_where_eulers_steps_add_a_little_energy_the_exponential_scheme_takes_as_
     setting = prepare(problem)
     assert (setting.model.scheme, setting.steps) == ("exponential", 1000)
     assert prepare(problem, 1000).model.scheme == "euler"
-    found = cb.simulate_exits(problem, paths=50_000, rng=1)
+    found = cb.simulate_exits(problem, paths=40_000, rng=1)
     assert found.lower < 0.0052 < found.upper < 0.007
 
 

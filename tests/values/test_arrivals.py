@@ -7,7 +7,7 @@ import pytest
 
 import certbound as cb
 from certbound.values.continuous import bound_exits, straight
-from certbound.values.continuous.line import ladder
+from certbound.values.continuous.line import arrivals, ladder
 from certbound.values.continuous.line.arrivals import complement
 
 
@@ -31,7 +31,9 @@ def hitting(x, low, high, horizon):
     return y / width + 2 / np.pi * np.sum((-1.0) ** k / k * series)
 
 
-def test_brownian_motion_between_a_wall_and_a_target():
+@pytest.mark.usefixtures("frugal")
+def test_brownian_motion_between_a_wall_and_a_target(monkeypatch):
+    monkeypatch.setattr(arrivals, "_RUNGS", 1)
     # with no drift the noise-free path misses: the engine is asked itself
     from certbound.safety.engines import values_engine
 
@@ -44,7 +46,9 @@ def test_brownian_motion_between_a_wall_and_a_target():
     assert lower < truth < upper < 1.02 * lower
 
 
-def test_bounds_hold_a_simulation_and_are_close():
+@pytest.mark.usefixtures("frugal")
+def test_bounds_hold_a_simulation_and_are_close(monkeypatch):
+    monkeypatch.setattr(arrivals, "_RUNGS", 1)
     lower, upper, _ = bounds(flow(horizon=1.5))
     counted = cb.simulate_exits(flow(horizon=1.5), paths=30_000, rng=1, steps=1000)
     assert lower < counted.upper
@@ -59,7 +63,9 @@ def test_the_worst_start_is_the_farthest_one_on_either_side():
     assert bounds(mirrored)[:2] == pytest.approx(far, rel=1e-3)
 
 
-def test_where_nothing_limits_the_other_side_a_path_may_come_back():
+@pytest.mark.usefixtures("frugal")
+def test_where_nothing_limits_the_other_side_a_path_may_come_back(monkeypatch):
+    monkeypatch.setattr(arrivals, "_RUNGS", 1)
     lower, upper, answer = bounds(flow(safe=(-1.5, np.inf)))
     assert lower == 0.0
     assert answer.log10_lower is None

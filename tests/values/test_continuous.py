@@ -218,7 +218,7 @@ def test_ranges_of_the_residual_contain_samples_of_a_random_surface(n: int, part
         ranges = dataclasses.replace(found[0], residual_low=found[1].residual_low)
     for index in range(len(patches.size)):
         slab, *cell = np.unravel_index(index, (2, *surface.cells))
-        for _ in range(30):
+        for _ in range(10):
             shares = rng.uniform(size=n + 1)
             v, rate, gradient, second = hermite_values(surface, slab, cell, shares[0], shares[1:])
             t = surface.times[slab] + shares[0] * surface.steps[slab]
@@ -312,6 +312,7 @@ def test_the_order_of_the_patches_does_not_matter() -> None:
 WELL = (lambda x: [x[0] - x[0] ** 3], 0.35, 0.0, 2.5, 10.0, (0.9, 1.1))
 
 
+@pytest.mark.usefixtures("lighter")
 @pytest.mark.parametrize(
     ("f", "g", "low", "high", "horizon", "start"),
     [
@@ -329,6 +330,7 @@ def test_both_bounds_are_near_the_truth(f, g, low, high, horizon, start) -> None
     assert truth - math.log10(1.25) < found.lower <= truth + 1e-4
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("seed", [0, 5, 7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3, 4, 6))])
 def test_random_problems_lie_between_the_bounds(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -348,6 +350,7 @@ def test_random_problems_lie_between_the_bounds(seed: int) -> None:
     assert found.upper < max(0.6 * truth, truth + 0.2)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_the_worst_disturbance_counts_in_both_bounds() -> None:
     problem = line_problem(
         lambda x, d: [-x[0] + d[0]], 0.4, -1.0, 1.0, 1.0, (0.0, 0.0), disturbance=cb.Box([-0.2], [0.2])
@@ -386,6 +389,7 @@ def proposals():
     return model, starts_of(problem), upper, lower
 
 
+@pytest.mark.usefixtures("coarse")
 def test_noise_on_a_proposal_never_passes_the_truth() -> None:
     model, starts, upper, lower = proposals()
     truth = math.log(max(well_truth(10.0, x) for x in WELL[5]))
@@ -451,12 +455,14 @@ def two_free_states() -> cb.Problem:
 TWO_FREE_STATES = math.log10(1 - (1 - exit_probability(lambda t, x: -x, lambda t, x: 0.5 + 0 * x, -1, 1, 1, 0.0)) ** 2)
 
 
+@pytest.mark.usefixtures("frugal")
 def test_two_states_without_coupling_are_as_safe_as_each_alone() -> None:
     found = bound_exits(two_free_states(), seconds=0.01, delta=0.5)
     assert TWO_FREE_STATES <= found.upper < TWO_FREE_STATES + 0.16
     assert found.lower is None  # the bound above is small enough
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.8 * np.eye(2))
     problem = two_free_states().replace(system=system)
@@ -464,7 +470,7 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
     truth = math.log(1 - (1 - alone) ** 2)
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
     plane = two_sides.plane_of(problem, model, room.outer_low, room.outer_high, starts)
-    plan = plan_below(plane, truth, 1200)
+    plan = dataclasses.replace(plan_below(plane, truth, 1200), cells=10, growth=0.5)
     proposals: list[Any] = []
     monkeypatch.setattr(plane_below, "propose_plane", lambda *given: proposals.append(given) or propose_plane(*given))
     found = bound_plane_below(plane, model, plan, starts, None)
@@ -490,6 +496,7 @@ def test_a_lower_bound_in_two_states_holds_whatever_is_proposed(monkeypatch: pyt
     assert payment is None or payment.log <= math.log(1 - (1 - soon) ** 2)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_source_of_any_size_never_takes_a_bound_below_the_truth() -> None:
     problem = two_free_states()
     model, room, starts = exits._model(problem), safe_room(problem), starts_of(problem)
@@ -578,6 +585,7 @@ def test_bad_arguments_are_named() -> None:
                 start_rates=np.zeros((1, 2, 3)), end_rates=np.zeros((1, 2, 3)))  # fmt: skip
 
 
+@pytest.mark.usefixtures("coarse")
 def test_an_obstacle_bounds_the_safe_set_on_its_side() -> None:
     plain = line_problem(lambda x: [-x[0]], 0.4, -1.0, 1.0, 1.0, (0.0, 0.0))
     walls = plain.replace(safe=[cb.Inside(cb.Box([-1], [3])), cb.Outside(cb.Box([1], [2]))])
@@ -585,6 +593,7 @@ def test_an_obstacle_bounds_the_safe_set_on_its_side() -> None:
     assert first.upper == pytest.approx(second.upper, abs=1e-3)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_disturbance_that_counts_between_the_ends_of_its_range_only_is_seen() -> None:
     """A comparison used as a number has slope 0 wherever it has one, so the ends of D do not stand for the rest."""
     system = cb.ContinuousSystem(

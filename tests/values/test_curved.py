@@ -198,7 +198,7 @@ def disc_proposals():
     problem = in_disc()
     model = exits._model(problem)
     plane, region, level, _ = bounding._setting(problem, model)
-    surface = propose_within(plane, Plan(cells=18, growth=0.4, lead=0.1, floor=level - 4), region.walls)
+    surface = propose_within(plane, Plan(cells=12, growth=0.4, lead=0.1, floor=level - 4), region.walls)
     assert surface is not None
     return problem, model, region.walls, surface
 
@@ -308,6 +308,7 @@ def test_a_certificate_that_cannot_state_a_curved_set_is_refused(monkeypatch: py
     assert bound_region is not exits.bound_region
 
 
+@pytest.mark.usefixtures("frugal")
 def test_the_probability_itself_is_proposed_within_a_disc_and_its_bound_holds_on_spoilt_proposals(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous import bound_exits, exits, is_confined
+from certbound.values.continuous import bound_exits, exits, is_confined, proposal
 from certbound.values.continuous.coefficients import enclose
 from certbound.values.continuous.held_faces import held_face, rarely_reached, resolved
 from certbound.values.continuous.payment import Payment, Terms
@@ -28,6 +28,7 @@ def root(x):
     return np.sqrt(np.maximum(x[0], 0.0))
 
 
+@pytest.mark.usefixtures("lighter")
 def test_a_price_reaches_its_limit_as_often_as_the_reflection_principle_says() -> None:
     """dx = x^2's half dt + s x dW: log x is Brownian motion."""
     s = 0.5
@@ -37,6 +38,7 @@ def test_a_price_reaches_its_limit_as_often_as_the_reflection_principle_says() -
     assert 10**found.lower <= exact <= 10**found.upper < 1.05 * 10**found.lower
 
 
+@pytest.mark.usefixtures("lighter")
 def test_a_rate_whose_noise_is_the_root_of_it_is_bounded_from_both_sides() -> None:
     """The square of Brownian motion in the plane: that its radius reaches sqrt 3 is known as a series."""
     asked = line(lambda x: [2.0], lambda t, x: [[2 * root(x)]], ([-1.0], [3.0]), start=0.25, horizon=0.5)
@@ -53,12 +55,14 @@ def test_a_rate_whose_noise_is_the_root_of_it_is_bounded_from_both_sides() -> No
     assert 10**found.lower <= 1 - stays <= 10**found.upper < 1.06 * 10**found.lower
 
 
+@pytest.mark.usefixtures("frugal")
 def test_a_population_that_dies_out_is_bounded_from_both_sides() -> None:
     """dx = sqrt(x) dW, absorbed at 0: less than the martingale's .5/2."""
     found = bound_exits(line(lambda x: [0.0], lambda t, x: [[root(x)]], ([-1.0], [2.0])), seconds=0.01)
     assert 0.03 < 10**found.lower <= 10**found.upper < min(0.25, 1.15 * 10**found.lower)
 
 
+@pytest.mark.usefixtures("frugal")
 @pytest.mark.parametrize("gone", [cb.HalfSpace([1], 0), cb.Box([-1], [0])])
 def test_who_is_to_keep_off_a_face_that_no_path_crosses_fails_as_he_touches_it(gone) -> None:
     """dx = sqrt(x) dW from 1/2 has died out by 2 with probability exp(-1/2); a path stays in x >= 0 for ever."""
@@ -69,6 +73,7 @@ def test_who_is_to_keep_off_a_face_that_no_path_crosses_fails_as_he_touches_it(g
     assert math.exp(-0.5) < 10**near.upper < 0.9
 
 
+@pytest.mark.usefixtures("coarse")
 def test_in_two_states_who_touches_what_is_to_be_avoided_fails_too() -> None:
     """As before beside another state; who is to stay where x >= 0 reaches 2 first with .25 at most."""
     def noise(x):
@@ -81,6 +86,7 @@ def test_in_two_states_who_touches_what_is_to_be_avoided_fails_too() -> None:
         bound_exits(asked.replace(safe=[*asked.safe, cb.Outside(cb.HalfSpace([1, 0], 0))]), seconds=0.5)
 
 
+@pytest.mark.usefixtures("lighter")
 def test_a_share_of_genes_is_bounded_the_same_seen_from_either_end() -> None:
     """The upper face is one at which rounding would leave the root without a value."""
     def g(t, x):
@@ -93,7 +99,10 @@ def test_a_share_of_genes_is_bounded_the_same_seen_from_either_end() -> None:
     assert found[0].lower > found[0].upper - 0.05
 
 
-def test_nobody_leaves_where_no_face_can_be_crossed() -> None:
+@pytest.mark.usefixtures("coarse")
+def test_nobody_leaves_where_no_face_can_be_crossed(monkeypatch) -> None:
+    """The steps that are granted to the line that ends before the faces lead nowhere, however many they are."""
+    monkeypatch.setitem(proposal.propose.__kwdefaults__, "most_steps", 400)
     logistic = line(lambda x: [x[0] * (1 - x[0])], lambda t, x: [[x[0] * (1 - x[0])]], ([0.0], [1.0]))
     assert bound_exits(logistic, seconds=0.01).upper < -100
 
@@ -206,6 +215,7 @@ def test_an_epidemic_is_bounded_near_what_simulations_say() -> None:
     assert 9e-4 < 10 ** bound_exits(epidemic(([0, 0], [1, 0.12])), seconds=10).upper < 4e-3
 
 
+@pytest.mark.usefixtures("coarse")
 def test_where_the_drift_leads_back_a_face_costs_about_what_the_quasipotential_says() -> None:
     """dx = -x dt + .3 dW from 0 to 1 within 5: x^2 / sigma^2 = 11.1 is what -log P is about."""
     asked = line(lambda x: [-x[0]], lambda t, x: [[0.3]], ([-1.0], [1.0]))
@@ -238,6 +248,7 @@ def test_a_spike_of_a_nerve_cell_is_bounded_near_what_simulations_say() -> None:
     assert 0.1068 < 10 ** bound_exits(nerve(10, [cb.HalfSpace([1, 0], 0.0)]), seconds=20).upper < 0.17
 
 
+@pytest.mark.usefixtures("frugal")
 def test_filtered_noise_is_bounded_above_its_closed_form() -> None:
     """v is a process of one state, and x follows it: the bound must not be below that of v alone."""
     system = cb.ContinuousSystem(lambda x, v: [v - x, -v], states=["x", "v"], diffusion=[[0], [0.6]])

@@ -29,7 +29,7 @@ BOX = cb.Box([-1], [1])
 UP = cb.HalfSpace([1.0], 0.9)
 
 
-def problem(safe: list[Any], start: Any = (0.0,), horizon: float = 1.0, f: Any = None, gain: Any = 0.4) -> cb.Problem:
+def problem(safe: list[Any], start: Any = (0.0,), horizon: float = 1.0, f: Any = None, gain: Any = 0.6) -> cb.Problem:
     system = cb.ContinuousSystem(f or (lambda x: -x), states=1, diffusion=gain)
     return cb.Problem(system, initial=list(start) if isinstance(start, tuple) else start, safe=safe, horizon=horizon)
 
@@ -56,6 +56,7 @@ CASES: dict[str, tuple[cb.Problem, float, float]] = {
 LONG = ("an instant", "a window that begins late", "an obstacle comes")
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in CASES])
 def test_bounds_of_every_kind_of_limit_hold_and_are_close(name: str) -> None:
     asked, above, below = CASES[name]
@@ -67,6 +68,7 @@ def test_bounds_of_every_kind_of_limit_hold_and_are_close(name: str) -> None:
     assert found.lower is None or 10**found.lower <= most * 1.005
 
 
+@pytest.mark.usefixtures("coarse")
 def test_before_a_window_the_line_ends_where_the_drift_lets_no_path_pass() -> None:
     """At the cut below, where noise in proportion to the state all but ends, no layer would fit the cells."""
     window = cb.Inside(cb.Box([0.5], [1.8]), during=(0.5, 1))
@@ -85,12 +87,14 @@ def test_between_two_limits_it_does_not_matter_that_paths_beyond_them_leave_ever
     assert math.log10(0.0322) < found.upper < math.log10(0.0345)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_window_may_have_a_limit_on_one_side_alone() -> None:
     asked = problem([cb.Inside(cb.Box([-0.6], [np.inf]), during=(0.3, 0.4)), cb.Inside(BOX, during=(0.8, 1))])
     least, most = bracket(asked, -4.0, 4.0, 1000, 300)
     assert least * 0.995 <= 10 ** bound_exits(asked, seconds=0.01, lower=False).upper <= 1.5 * most
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("seed", [3, pytest.param(13, marks=pytest.mark.slow)])
 def test_random_problems_lie_between_the_bounds(seed: int) -> None:
     assert check("line", seed, seconds=0.01, cells=1200)[0] == ""
@@ -147,6 +151,7 @@ WRONG = [("noise", 1e-6), ("noise", 1e-2), ("scaled", -0.05), ("scaled", 0.05), 
          ("steep", 0.05)]  # fmt: skip
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(("name", "tries"), [
     ("a random start", WRONG), pytest.param("a window that begins late", WRONG[1:4], marks=pytest.mark.slow),
 ])
@@ -233,6 +238,7 @@ def test_what_a_join_misses_is_the_largest_gap(rise: float) -> None:
     assert missing_upper(here, phases[0], narrow, (after, phases[1])) == pytest.approx(max(beyond, below), abs=1e-2)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_coordinates_that_move_are_joined_where_they_meet() -> None:
     asked = problem([
         cb.Inside(cb.Box([-1], [1], center=lambda t: [0.2 * t]), during=(0.0, 0.5)),
@@ -294,12 +300,14 @@ def test_what_is_not_served_is_refused_in_words(changes: dict[str, Any], message
 
 
 def test_bounds_do_not_depend_on_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ladder, "LADDER", ((1.0, 1e-2, 0.1), (1.5, 3e-3, 0.05), *ladder.LADDER))
     asked = problem([cb.Inside(BOX)])
     first = bound_exits(asked, seconds=0.1)
     ticks = iter(range(0, 10**9, 1000))
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(ticks)))
     second = bound_exits(asked, seconds=0.1)
     assert (first.upper, first.lower, first.words) == (second.upper, second.lower, second.words)
+    assert first.words.count(" x ") == 3, "cells x slabs, and of two attempts, of which the clock could have left one"
 
 
 def test_a_start_in_moving_coordinates_is_read_where_it_is() -> None:
@@ -315,6 +323,7 @@ def test_a_start_in_moving_coordinates_is_read_where_it_is() -> None:
     assert Start(low=2.0, high=2.0).highest(surface, phase) == math.inf
 
 
+@pytest.mark.usefixtures("coarse")
 def test_units_do_not_matter_until_floats_end() -> None:
     """Limits at 1e9 were refused, as if paths left every bound."""
 

@@ -6,8 +6,10 @@ import dataclasses
 import functools
 import math
 import types
+from typing import Any
 
 import numpy as np
+import pytest
 
 import certbound as cb
 from certbound.values.continuous import exits
@@ -42,18 +44,24 @@ def culture() -> tuple[Model, Plane]:
     return seen(cb.Problem(system, initial=cb.Box([1.4, 4.2], [1.6, 4.4]), safe=safe, horizon=10))
 
 
+@pytest.mark.usefixtures("frugal")
 def test_layers_much_thinner_than_cells_break_splines_but_not_a_monotone_proposal() -> None:
     model, plane = culture()
-    plan = Plan(cells=18, growth=0.25, lead=0.3)
+    plan = Plan(cells=18, growth=0.35, lead=0.3)
     assert propose_plane(plane, plan) is None
     surface = propose_monotone(plane, plan, None, 1.5)
     assert surface is not None
     assert surface.values[:, :, 0, :, 0].max() <= 1e-9
-    best = two_sides._refined(plane, model, plan, None, functools.partial(propose_monotone, raised=1.5), (-0.1,))
+
+    def propose(*given: Any) -> Surface | None:
+        return surface if given[-1] is None else propose_monotone(*given, raised=1.5)
+
+    best = two_sides._refined(plane, model, plan, None, propose, (-0.1,))
     assert best is not None
     assert prove_upper(best.surface, model, plane.starts).log < math.log(1e-3)  # it is below 1e-6
 
 
+@pytest.mark.usefixtures("frugal")
 def test_noise_on_a_monotone_proposal_never_passes_the_truth() -> None:
     model, plane = seen(decaying((1.0, 2.0), np.diag([0.6, 0.7])))
     surface = propose_monotone(plane, Plan(cells=10, growth=0.8, lead=0.05), None, 0.6)
@@ -69,9 +77,10 @@ def test_noise_on_a_monotone_proposal_never_passes_the_truth() -> None:
     assert truth <= min(bounds) < truth + 1.0
 
 
+@pytest.mark.usefixtures("frugal")
 def test_noise_that_is_shared_by_both_states_is_served() -> None:
     model, plane = seen(decaying((1.0, 2.0), np.array([[0.6, 0.0], [0.35, 0.6]])))
-    surface = two_sides._promising(plane, model, Plan(cells=12, growth=0.5, lead=0.05))
+    surface = two_sides._promising(plane, model, Plan(cells=10, growth=0.8, lead=0.05))
     assert surface is not None
     assert 0.217 < math.exp(prove_upper(surface, model, plane.starts).log) < 0.4  # 0.2176 of 200,000 paths
 

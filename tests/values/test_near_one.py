@@ -46,13 +46,14 @@ def plane(problem: cb.Problem) -> tuple[Plane, Model]:
     return plane_of(problem, model, room.inner_low, room.inner_high, starts_of(problem)), model
 
 
+@pytest.mark.usefixtures("frugal")
 def test_both_bounds_are_near_the_truth_and_hold_on_spoilt_proposals() -> None:
     odd = 2 * np.arange(30) + 1.0
     stays = 4 / np.pi * float(np.sum((-1.0) ** np.arange(30) / odd * np.exp(-((0.6 * np.pi * odd) ** 2) / 8)))
     truth = math.log(1 - stays**2)
     inner, model = plane(free())
-    above = near_one._bounded(inner, model, 10, truth, None, below=False)
-    below = near_one._bounded(inner, model, 10, truth, None, below=True)
+    above = near_one._bounded(inner, model, 8, truth, None, below=False)
+    below = near_one._bounded(inner, model, 8, truth, None, below=True)
     assert above is not None
     assert below is not None
     assert truth - 0.5 < below[1].log <= truth <= above[1].log < truth + 0.4
@@ -66,6 +67,7 @@ def test_both_bounds_are_near_the_truth_and_hold_on_spoilt_proposals() -> None:
     assert payment is None or payment.log <= truth
 
 
+@pytest.mark.usefixtures("frugal")
 def test_noises_that_go_together_have_both_bounds() -> None:
     """Without a margin no lower bound is found: second derivatives grow without limit in two of the corners."""
     gain = 0.6 * np.array([[1, 0], [0.7, math.sqrt(0.51)]])
@@ -120,6 +122,7 @@ def test_where_it_does_not_serve_the_logarithm_is_proposed(monkeypatch: pytest.M
         assert str(found) == "the logarithm"
 
 
+@pytest.mark.usefixtures("frugal")
 def test_a_side_that_is_no_limit_does_not_count_below() -> None:
     cut = ((True, False), (True, False))
     kept = [cb.Inside(cb.HalfSpace([1, 0], 1)), cb.Inside(cb.HalfSpace([0, 1], 1))]
@@ -256,9 +259,9 @@ def test_what_is_proved_where_failing_is_rare_stays_as_time_ends_and_grids_keep_
         return shares.pop()
 
     monkeypatch.setattr(near_one, "relative_below", proved)
-    assert near_one.rarely(inner, model, 8, 0.0, None, below=True) == -1.0
+    assert near_one.rarely(inner, model, 6, 0.0, None, below=True) == -1.0
     with pytest.raises(OutOfTime):
-        near_one.rarely(inner, model, 8, 0.0, None, below=True)
+        near_one.rarely(inner, model, 6, 0.0, None, below=True)
     cells, found = list[int](), {False: -9.0, True: -9.5}
 
     def bounded(plane: Plane, model: Model, count: int, level: float, points: object, *, below: bool) -> float:

@@ -19,6 +19,7 @@ def _problem(gain: Any, drift: Any = lambda t, x: -x, horizon: float = 2.0) -> c
     return cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.0], [1.0]))], horizon=horizon)
 
 
+@pytest.mark.usefixtures("lighter")
 def test_noise_that_jumps_is_bounded_closely_from_both_sides() -> None:
     problem = _problem(lambda t: [[np.where(t < 1, 0.2, 0.5)]])
     found = bound_exits(problem, seconds=0.2)

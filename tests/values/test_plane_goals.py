@@ -54,6 +54,7 @@ def aimed():
     return [(aim, propose_to_target(aim.plane, plan, target, upper=aim.upper)) for aim, plan in zip(aims, plans)]
 
 
+@pytest.mark.usefixtures("frugal")
 def test_bounds_with_a_target_hold_what_a_simulation_finds(aimed):
     (above, upper), (below, lower) = aimed
     found = targets.prove_failing_above(upper, above)[1].log
@@ -62,6 +63,7 @@ def test_bounds_with_a_target_hold_what_a_simulation_finds(aimed):
     assert least is None or least.log <= LATE[1]
 
 
+@pytest.mark.usefixtures("frugal")
 @pytest.mark.parametrize(
     ("size", "shift"), [(0.0, -3.0), (0.0, 0.4), *(pytest.param(*one, marks=pytest.mark.slow) for one in SPOILT)]
 )
@@ -72,6 +74,7 @@ def test_no_proposal_makes_a_bound_with_a_target_that_is_wrong(aimed, size, shif
     assert least is None or least.log <= LATE[1]
 
 
+@pytest.mark.usefixtures("frugal")
 @pytest.mark.parametrize("upper", [True, False])
 def test_proposals_of_arriving_are_bent_where_noises_go_together_and_hold_simulations(upper):
     gain = [[0.4, 0.25], [0.0, 0.4]]
@@ -98,6 +101,7 @@ def test_a_start_on_a_line_of_the_grid_is_read_on_that_line(aimed):
     assert seen.max() <= above < wide
 
 
+@pytest.mark.usefixtures("frugal")
 def test_a_start_that_may_lie_in_the_target_has_no_lower_bound(aimed):
     aim, lower = aimed[1]
     assert targets.proved_below(lower, aim) is not None
@@ -105,6 +109,7 @@ def test_a_start_that_may_lie_in_the_target_has_no_lower_bound(aimed):
     assert targets.proved_below(lower, inside) is None
 
 
+@pytest.mark.usefixtures("frugal")
 def test_a_horizon_that_is_shorter_does_not_inherit_what_a_longer_one_has(aimed):
     early = dataclasses.replace(aimed[0][1], times=0.5 * aimed[0][1].times)
     aim = dataclasses.replace(aimed[0][0], plane=dataclasses.replace(aimed[0][0].plane, horizon=0.5))
@@ -164,6 +169,7 @@ def chains():
     return found
 
 
+@pytest.mark.usefixtures("frugal")
 def test_bounds_over_windows_hold_what_a_simulation_finds(chains):
     (above, upper), (below, lower) = chains
     assert [stage.high for stage in above.stages] == [(1.0, 1.0), (0.6, 0.6)]
@@ -174,6 +180,7 @@ def test_bounds_over_windows_hold_what_a_simulation_finds(chains):
     assert -2.5 < least.log <= NARROW[1]
 
 
+@pytest.mark.usefixtures("frugal")
 @pytest.mark.parametrize(("which", "shift"), [(0, -0.7), (1, 0.6)])
 def test_no_surface_of_a_stage_makes_a_bound_that_is_wrong(chains, which, shift):
     for chain, surfaces in chains:

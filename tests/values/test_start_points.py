@@ -86,6 +86,7 @@ def test_a_lower_bound_from_a_disc_is_none_of_the_corners_of_its_box(monkeypatch
     assert extreme_over(surface, ends, upper=False, points=inside) < 100
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_ball_in_one_state_counts_without_what_rounding_adds_to_it() -> None:
     system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.4)
     ball, box = (

@@ -18,6 +18,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from certbound.arrays import Array
 from certbound.rigor.intervals import Interval, abs_, exp, sq
 
 KAPPA = 1.4
@@ -89,6 +90,23 @@ def density_tail(order: int, z: float) -> float:
     return 2 * z ** (order - 1) * density / (1 - (order - 1) / (z * z)) * (1 + 1e-9) + 1e-300
 
 
+@lru_cache(maxsize=8)  # one rule after the other is tried
+def _ellipses(
+    half: float, order: int, reach: float, ratio: float, degree: int
+) -> list[tuple[float, Array, Array]]:
+    """rho, and for each piece of z0 the exponents of the densities, and log (1 + |z|)^order |b|."""
+    left = np.arange(0.0, reach, 1 / 16)
+    right, found = left + 1 / 16, []
+    for rho in (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0, 192.0, 256.0):
+        a, b = (rho + 1 / rho) / 2, (rho - 1 / rho) / 2
+        widest = math.log(2 * a * a + 2 * b * b + 1) if degree == 2 else 3 * math.log(rho)
+        nearest = np.maximum(left - half * a, 0.0)
+        size = right + half * (a + b)
+        first = -(nearest**2) / 2 + (half * b) ** 2 / 2 + (right + half) ** 2 / (2 * ratio**2)
+        found.append((rho, first, np.log(1 + size) * order + widest))
+    return found
+
+
 @lru_cache(maxsize=256)
 def quadrature_error(
     points: int, half: float, order: int, reach: float, ratio: float = KAPPA, degree: int = 2
@@ -106,16 +124,8 @@ def quadrature_error(
     |He_k(z)| <= (1 + |z|)^k for k <= 3, three times that for k = 4. The mass is at least the width times the least
     density. The supremum over z0 is taken in pieces.
     """
-    left = np.arange(0.0, reach, 1 / 16)
-    right = left + 1 / 16
-    best = np.full(left.shape, np.inf)
-    more = math.log(3) if order == 4 else 0.0
-    for rho in (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0, 192.0, 256.0):
-        a, b = (rho + 1 / rho) / 2, (rho - 1 / rho) / 2
-        widest = math.log(2 * a * a + 2 * b * b + 1) if degree == 2 else 3 * math.log(rho)
-        nearest = np.maximum(left - half * a, 0.0)
-        size = right + half * (a + b)
-        exponent = -(nearest**2) / 2 + (half * b) ** 2 / 2 + (right + half) ** 2 / (2 * ratio**2)
-        exponent += np.log(1 + size) * order + widest - (2 * points - 1) * math.log(rho)
+    best, more = np.array(np.inf), math.log(3) if order == 4 else 0.0
+    for rho, first, grown in _ellipses(half, order, reach, ratio, degree):
+        exponent = first + (grown - (2 * points - 1) * math.log(rho))
         best = np.minimum(best, exponent + math.log(4 / (rho - 1) * ratio) + more)
     return float(np.exp(best.max())) * (1 + 1e-9)

@@ -85,7 +85,7 @@ def test_second_derivatives_between_nodes_lie_on_their_side(name: str) -> None:
     problem, transition, value = setting(name, 2)
     std, grid = STEPS[name][1], transition.step.grid
     n, h = len(std), 2e-3
-    points = np.random.default_rng(5).uniform(-0.99, 0.99, (60 if n < 3 else 5, n))
+    points = np.random.default_rng(5).uniform(-0.99, 0.99, (60 if n < 3 else 3, n))
     step = compile_numpy(problem.closed_loop)
 
     def phi(x: np.ndarray) -> np.ndarray:

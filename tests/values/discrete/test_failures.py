@@ -164,9 +164,9 @@ def _random(rng: np.random.Generator) -> cb.Problem:
     return cb.Problem(system, initial=start, safe=safe, horizon=horizon)
 
 
-def _check(seed: int, paths: int) -> None:
+def _check(seed: int, paths: int, seconds: float) -> None:
     problem = _random(np.random.default_rng(seed))
-    found = bound_failure(problem, seconds=1.0, ratio=1.05)
+    found = bound_failure(problem, seconds=seconds, ratio=1.05)
     low, high = limits(problem, paths, seed)
     assert found.upper >= low
     assert found.lower <= high
@@ -175,13 +175,13 @@ def _check(seed: int, paths: int) -> None:
 
 @pytest.mark.parametrize("seed", range(16))
 def test_random_problems_agree_with_simulation(seed: int) -> None:
-    _check(seed, 20_000)
+    _check(seed, 20_000, 1.0 if seed in (3, 8, 12, 13) else 0.3)  # those are close on finer grids only
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(16, 216))
 def test_many_random_problems_agree_with_simulation(seed: int) -> None:
-    _check(seed, 400_000)
+    _check(seed, 400_000, 1.0)
 
 
 DISTURBED = [
@@ -291,7 +291,11 @@ def test_where_the_model_is_undefined_counts_as_failing() -> None:
         ({"noise": cb.Gaussian(std=1e-8)}, "of use"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_words(change: dict[str, Any], words: str) -> None:
+def test_what_does_not_fit_is_refused_in_words(
+    monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], words: str
+) -> None:
+    monkeypatch.setattr(failures, "_MOST_NODES", 30_000)
+    monkeypatch.setattr(layout, "_MOST_PLACES", layout._MOST_PLACES // 100)
     with pytest.raises(Inapplicable, match=words):
         bound_failure(scalar(**change))
 

@@ -77,7 +77,7 @@ def simulated(problem: cb.Problem, paths: int, rng: np.random.Generator) -> tupl
 def test_the_bound_is_above_what_simulation_counts_and_near_it(force, s, low, high, start, most) -> None:
     problem = mechanical(force, s, low, high, 1.5, start)
     setting = setting_of(problem)
-    bound, below = both_bounds(setting, COARSE)
+    bound, below = both_bounds(setting, replace(COARSE, count=15, wide=0.02))
     share, error = simulated(problem, 8000, np.random.default_rng(1))
     assert bound >= share - 4 * error
     assert bound <= most * (share + 4 * error)
@@ -190,9 +190,9 @@ def test_states_may_come_in_either_order() -> None:
 
 def test_a_start_that_runs_into_a_face_is_sure_to_fail_and_a_longer_horizon_never_safer() -> None:
     force = (lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3])
-    short, long = (replace(COARSE, count=count) for count in (6, 8))
-    doomed = setting_of(mechanical(*force, 0.375, (0.79, 2.0)))
-    assert bound_by_steps(doomed, short) == pytest.approx(1.0, rel=1e-3)
+    at_once, short, long = (replace(COARSE, count=count) for count in (1, 6, 8))
+    doomed = setting_of(mechanical(*force, 0.0625, (0.79, 2.0)))
+    assert bound_by_steps(doomed, at_once) == pytest.approx(1.0, rel=1e-3)
     safer, riskier = (setting_of(mechanical(*force, horizon, (0.5, 0.4))) for horizon in (0.375, 0.5))
     assert 0.0035 < bound_by_steps(safer, short) < bound_by_steps(riskier, long) < 0.1  # .0037 by simulation
 
@@ -208,7 +208,7 @@ def exit_at_the_end() -> float:
 
 
 def test_the_engine_answers_mechanical_problems(monkeypatch) -> None:
-    monkeypatch.setattr(values, "_SECONDS", 1.0)
+    monkeypatch.setattr(values, "_SECONDS", 0.3)
     problem = mechanical(lambda x: -2 * x[0] - x[1], 0.8, [-0.8, -3], [0.8, 3], 0.8, (0.1, 0.0))
     answer = values.values_engine(problem)
     assert answer.applicable
@@ -243,7 +243,7 @@ def test_more_work_buys_finer_plans_and_the_clock_is_not_asked() -> None:
 
 
 def test_a_force_that_changes_with_time_acts_when_it_does() -> None:
-    plan, found = replace(COARSE, count=6, wide=0.03), []
+    plan, found = replace(COARSE, count=6, wide=0.03, fine=1.5), []
     for push in (2.5, -2.5):  # the same in reversed order
         problem = pushed(lambda t, push=push: push * np.sin(4 * np.pi * t), 0.5)
         upper, lower = bounds_by_steps(setting_of(problem), plan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import replace
@@ -155,7 +156,7 @@ def test_the_majorant_of_the_smoothed_function_lies_above_it_and_so_do_its_deriv
     mesh = Y[ROWS]
     rows = smoothed(value, (flat, flat), (Y, Q), (mesh, Q), one, two)
     gain = []
-    for _ in range(8):
+    for _ in range(4):
         y, w = rng.uniform(mesh[2], mesh[-3]), rng.uniform(-0.8, 0.8)
         k, c = int(np.searchsorted(mesh, y)) - 1, int(np.searchsorted(Q, w)) - 1
         t, d = (y - mesh[k]) / (mesh[k + 1] - mesh[k]), Q[c + 1] - Q[c]
@@ -182,6 +183,27 @@ def frame_and_bands(problem: cb.Problem, **plan):
     settings = {"count": 10, "fine": 1.2, "wide": 0.02, "cell": 0.5, "spare": 1e-7} | plan
     setting = setting_of(problem)
     return setting, next(layouts_of(setting, Plan(**settings)))
+
+
+def near_1(force, horizon: float) -> cb.Problem:
+    return mechanical(force, 0.5, [0, -1.5], [1.6, 1.5], horizon, (1.0, 0.0))
+
+
+@functools.cache
+def a_spring():
+    return frame_and_bands(near_1(lambda x: -x[0] - 0.5 * x[1], 1.0))
+
+
+@functools.cache
+def a_well():
+    return frame_and_bands(near_1(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 1.0))
+
+
+@functools.cache
+def a_well_in_long_steps():
+    """Cells of a band have variances of their own."""
+    problem = near_1(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 2.0)
+    return frame_and_bands(problem, count=14, wide=0.06, fine=2.0, cell=0.3)
 
 
 def step_law(setting, clock, x, rng, count: int):
@@ -228,7 +250,7 @@ def spoiled_band(band: Band, y, q, size: float, rng) -> Band:
 
 
 def test_kernels_that_are_off_change_a_step_by_less_than_what_is_paid_for_rounding(rng) -> None:
-    _, layout = frame_and_bands(mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 0.5, [0, -1.5], [1.6, 1.5]))
+    _, layout = a_well()
     frame = layout.frame
     shape = frame.y.size, frame.q.size
     value = Lines(nodal=rng.uniform(0, 1, shape), bend=rng.uniform(-20, 20, (shape[0], shape[1] - 1)))
@@ -295,8 +317,7 @@ def test_rounding_sees_the_lines_that_are_near(rng) -> None:
 
 
 def test_every_cell_of_a_band_has_the_variance_of_its_own_step(rng) -> None:
-    problem = mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 0.5, [0, -1.5], [1.6, 1.5], 2.0, (1.0, 0.0))
-    setting, layout = frame_and_bands(problem, count=14, wide=0.06, fine=2.0, cell=0.3)
+    setting, layout = a_well_in_long_steps()
     frame, q, k = layout.frame, layout.frame.q, 8.0
     nodal = np.broadcast_to(np.exp(k * q), (frame.y.size, q.size))
     value = Lines(nodal=nodal, bend=np.broadcast_to(-(k**2) * np.exp(k * q[:-1]), (frame.y.size, q.size - 1)))
@@ -321,8 +342,7 @@ def test_every_cell_of_a_band_has_the_variance_of_its_own_step(rng) -> None:
 
 
 def test_every_cell_pays_for_what_lies_between_two_variances(rng) -> None:
-    problem = mechanical(lambda x: x[0] - x[0] ** 3 - 0.5 * x[1], 0.5, [0, -1.5], [1.6, 1.5], 2.0, (1.0, 0.0))
-    _, layout = frame_and_bands(problem, count=14, wide=0.06, fine=4.0)
+    _, layout = a_well_in_long_steps()
     frame, band = layout.frame, max(layout.bands, key=lambda one: one.apart)
     nodal = np.broadcast_to(rng.uniform(0, 1, frame.q.size), (frame.y.size, frame.q.size))
     value, flat = Lines(nodal=nodal, bend=0 * nodal[:, 1:]), 0 * nodal[1:, 1:]
@@ -337,10 +357,9 @@ def test_every_cell_pays_for_what_lies_between_two_variances(rng) -> None:
     assert np.all(paid(0.75) >= 0.75 * least * (1 - 1e-6))  # T_v, a function f of v, is off by (v - a)(b - v)/2 |f''|
 
 
-@pytest.mark.parametrize("force", [lambda x: -x[0] - 0.5 * x[1], lambda x: x[0] - x[0] ** 3 - 0.5 * x[1]])
-def test_a_step_back_lies_above_the_mean_of_any_function_on_the_grid(force, rng) -> None:
-    problem = mechanical(force, 0.5, [0, -1.5], [1.6, 1.5], 1.0, (1.0, 0.0))
-    setting, layout = frame_and_bands(problem)
+@pytest.mark.parametrize("made", [a_spring, a_well])
+def test_a_step_back_lies_above_the_mean_of_any_function_on_the_grid(made, rng) -> None:
+    setting, layout = made()
     frame = layout.frame
     y, q = np.meshgrid(frame.y, frame.q, indexing="ij")
     value = Lines(nodal=np.exp(2 * (q - 2 * y)) / 40, bend=np.full((y.shape[0], y.shape[1] - 1), -0.05))

@@ -87,7 +87,8 @@ class Start:
             def below(place: float) -> arb:
                 return ((arb(self.mean) - arb(place)) / root).erfc() / 2
 
-            low, high = [below(float(v)) for v in x.lo], [below(float(v)) for v in x.hi]
+            low = [below(float(v)) for v in x.lo]
+            high = low if np.array_equal(x.lo, x.hi) else [below(float(v)) for v in x.hi]
             if most:
                 parts = [upper(b - a) for a, b in zip(low[:-1], high[1:])]
                 ends = (upper(high[0]), upper(1 - low[-1]))

@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -181,6 +181,7 @@ def plan_above(plane: Plane, level: float, patches: float) -> Plan:
     return plan
 
 
+@lru_cache(maxsize=4)  # a plane is asked again as faces are left out
 def rough_level(plane: Plane) -> float:
     """log P from a coarse proposal; 0 where that breaks down."""
     plans = [Plan(cells=28, growth=0.4, lead=0.02 * plane.horizon)]
