@@ -295,19 +295,33 @@ def test_an_interruption_that_compiled_code_drops_comes_again() -> None:
     assert sys.unraisablehook is hook
 
 
+def _handed_over(text: str, pipe: Path, process: subprocess.Popen[str]) -> None:
+    """Write to a pipe once a process reads it; it must not have ended before."""
+    while True:
+        assert process.poll() is None, process.communicate()[1]
+        try:
+            end = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:  # nobody reads it yet
+            time.sleep(0.02)
+            continue
+        with os.fdopen(end, "w") as file:
+            file.write(text)
+        return
+
+
 def test_a_program_that_is_stopped_from_outside(tmp_path: Path) -> None:
     """Ctrl-C in a terminal: SIGINT to the installed program."""
     file = tmp_path / "swing.toml"
     command = [sys.executable, "-m", "certbound", "simulate", str(file), "--paths", "1e12", "--step", "0.005"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    os.mkfifo(file)  # opening it to write waits until the program reads its problem: it has started
+    os.mkfifo(file)  # it can be written to as soon as the program reads its problem: it has started
     # a program in the background of a shell inherits that Ctrl-C is ignored
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         for patience in (0.6, 10.0, 40.0):
             process = subprocess.Popen(command, text=True, cwd=tmp_path, **pipes)
             try:
-                file.write_text(GOOD)
+                _handed_over(GOOD, file, process)
                 time.sleep(patience)
                 process.send_signal(signal.SIGINT)
                 out, err = process.communicate(timeout=20)
