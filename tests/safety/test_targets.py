@@ -253,6 +253,9 @@ def test_where_inputs_are_held_a_target_is_met_at_a_sampling_time():
     data["proof"]["time"], data["problem"]["reach"]["during"] = (1.75).hex(), None
     with pytest.raises(CertificateError, match=r"`proof.time` must be a sampling time"):
         check_data(data)
+    data["problem"]["horizon"] = None
+    with pytest.raises(CertificateError, match=r"`problem.hold` must be left out .* without an end"):
+        check_data(data)
     between = cb.verify_safety(held((1.1, 1.4)))
     assert between.status == "UNKNOWN"
     assert "let its `during` hold a multiple of that" in between.reason

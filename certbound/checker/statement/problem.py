@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 
 from flint import arb, arb_mat
 
@@ -17,13 +16,12 @@ from certbound.checker.statement.drawn import Drawn, read_drawn
 from certbound.checker.statement.law_pieces import Piece
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
-from certbound.checker.statement.tapes import read_tape
+from certbound.checker.statement.tapes import Hold, read_hold, read_tape
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
 MOST_STATES = 400
 MOST_STEPS = 100_000
-MOST_SAMPLES = 1000
 _STAYING = "reach and stay"
 _SLACK = arb(2) ** -39
 """How far a covariance may miss semidefiniteness where every variance is 1."""
@@ -79,15 +77,6 @@ class Initial:
     radius: float = 0.0
     shape: arb_mat | None = None
     around: bool = False
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Hold:
-    """Inputs that are held: the law (t, states) that computes them at the beginnings of ``count`` equal parts."""
-
-    count: int
-    law: Tape
-    names: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -168,7 +157,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         read_constraint(item, f"{path}.constraints[{index}]", n, horizon, budget)
         for index, item in enumerate(record.items("constraints", 0, 1000))
     ]
-    hold = _hold(record, states, inputs)
+    hold = read_hold(record, states, inputs)
     initial, members = _starts(record["initial"], path + ".initial", n, budget)
     if domain is not None:
         budget.hold(n * n // 4 + 1)
@@ -194,17 +183,6 @@ def _unit(record: Record, continuous: bool) -> str:
         raise CertificateError(f"`{record.at('units')}` must be texts by names.")
     own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
     return own.get("time", "s" if continuous else "steps")
-
-
-def _hold(record: Record, states: tuple[str, ...], inputs: tuple[str, ...]) -> Hold | None:
-    """The law of inputs that are held: {"count": sampling times, "law": tape}."""
-    if "hold" not in record.value:
-        return None
-    inner = Record(record["hold"], record.at("hold"), ("count", "law"))
-    if record["time"] != "continuous" or not inputs:
-        raise CertificateError(f"`{inner.path}` must be left out in discrete time, and without inputs.")
-    count = inner.whole("count", 1, MOST_SAMPLES)
-    return Hold(count=count, law=read_tape(inner["law"], inner.at("law"), ("t", *states), (len(inputs),)), names=inputs)
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:
@@ -334,7 +312,7 @@ def met_at(model: Model, time: float) -> Model:
     CertificateError where the time is none of the window, the plan is an array over a longer time, or inputs that are
     held are not computed then.
     """
-    target, hold = model.target, model.hold
+    target = model.target
     assert target is not None
     first, last = target.during or (0.0, model.horizon)
     if not (first <= time <= last and time > 0) or (not model.continuous and time != int(time)):
@@ -344,11 +322,6 @@ def met_at(model: Model, time: float) -> Model:
         if model.continuous:
             raise CertificateError("`proof.time` must be the horizon where the plan is an array.")
         plan = plan[: int(time)]
-    if hold is not None:
-        samples = hold.count * Fraction(repr(time)) / Fraction(repr(model.horizon))
-        if samples.denominator != 1:
-            raise CertificateError("`proof.time` must be a sampling time where inputs are held.")
-        hold = replace(hold, count=int(samples))
     kept = []
     for constraint in model.constraints:
         begin, end = constraint.during or (0.0, model.horizon)
@@ -358,6 +331,7 @@ def met_at(model: Model, time: float) -> Model:
     due = replace(target, during=(time, time))
     number = len(kept) if model.domain is None else len(kept) - 1  # the domain stands last
     constraints = (*kept[:number], due, *kept[number:])
+    hold = None if model.hold is None else model.hold.until(time, model.horizon)
     return replace(model, horizon=time, plan=plan, hold=hold, target=None, constraints=constraints)
 
 

@@ -1,9 +1,11 @@
-"""Tapes as data: reading them, and telling whether two are the same function up to the order of their nodes."""
+"""Tapes as data: reading them and held laws, and whether two are the same function up to the order of their nodes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 from certbound.checker.expressions import OPERATIONS
@@ -13,6 +15,37 @@ from certbound.errors import CertificateError
 from certbound.problem.model import Layer, Network, Node, Part, Tape
 
 MOST_LAYERS, MOST_WIDTH = 32, 4096
+MOST_SAMPLES = 1000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Hold:
+    """Inputs that are held: the law (t, states) that computes them at the beginnings of ``count`` equal parts."""
+
+    count: int
+    law: Tape
+    names: tuple[str, ...]
+
+    def until(self, time: float, horizon: float) -> Hold:
+        """The same up to a sampling time; both times are read as the decimal numbers that they are written as.
+
+        CertificateError where it is none.
+        """
+        samples = self.count * Fraction(repr(time)) / Fraction(repr(horizon))
+        if samples.denominator != 1:
+            raise CertificateError("`proof.time` must be a sampling time where inputs are held.")
+        return replace(self, count=int(samples))
+
+
+def read_hold(record: Record, states: tuple[str, ...], inputs: tuple[str, ...]) -> Hold | None:
+    """The law of inputs that are held: {"count": sampling times, "law": tape}."""
+    if "hold" not in record.value:
+        return None
+    inner = Record(record["hold"], record.at("hold"), ("count", "law"))
+    if record["time"] != "continuous" or record["horizon"] is None or not inputs:
+        raise CertificateError(f"`{inner.path}` must be left out in discrete time, without an end, and without inputs.")
+    count = inner.whole("count", 1, MOST_SAMPLES)
+    return Hold(count=count, law=read_tape(inner["law"], inner.at("law"), ("t", *states), (len(inputs),)), names=inputs)
 
 
 def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[int, ...]) -> Tape:
