@@ -1,0 +1,121 @@
+"""Graded axes: cells that are small where the solution varies, by the scales of the equation.
+
+- Inside, a cell is a share of the range that paths visit; beyond the range cells grow.
+- Toward a limit that noise crosses against the flow, the solution has a layer of width a / (2 |f_n|).
+- Toward a noise-free limit, paths graze it where the flow across, c v, changes its sign. Noise smooths what grazing
+  leaves over the distance c v_0^3 / a, where v_0 is the cell about v = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.values.backward.setting import Setting
+
+_FINE = 100001  # points on which an axis is planned
+_ALONG = 41  # points along each axis of a face
+_BEYOND, _WIDEST = 0.35, 4.0  # growth of cells beyond the range, and their largest size there
+_TO_LIMIT, _TO_FREE, _ABOUT = 0.25, 0.3, 0.12  # growth away from noisy limits, noise-free limits, grazing points
+_LAYER = 3.0  # cells are at most a / (this |f|) at a limit
+_SMALLEST = 0.15  # of an inner cell, at noisy limits
+
+Size = Callable[[Array], Array]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Grazing:
+    """Where paths graze a noise-free limit: the face, the speed of a typical cell, and the scale across."""
+
+    axis: int
+    side: int
+    speed: float
+    scale: float
+
+
+def plan_axes(setting: Setting, cell: Array, row: int) -> tuple[list[Array], list[Grazing]]:
+    """Nodes of each axis, and where paths graze; ``cell`` holds a share of the range an axis, ``row`` says which ends (inner 0)."""
+    low, high = setting.low[row], setting.high[row]
+    width = setting.range[1] - setting.range[0]
+    cell = np.broadcast_to(cell, width.shape)
+    n = setting.dimension
+    sizes: list[list[Size]] = [[_inner(cell[i] * width[i], *setting.range[:, i])] for i in range(n)]
+    grazing: list[Grazing] = []
+    for i in range(n):
+        for side, place in enumerate((low[i], high[i])):
+            if not setting.limited[side, i]:
+                continue
+            points = _face(setting, low, high, i, place)
+            f, a = setting.flow(points)[i], setting.spread(points).reshape(n, n, *points.shape[1:])
+            if setting.noisy[i]:
+                sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
+            else:
+                grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place)
+    return [_nodes(low[i], high[i], sizes[i]) for i in range(n)], grazing
+
+
+def _inner(size: float, low: float, high: float) -> Size:
+    return lambda y: size * np.minimum(1 + _BEYOND * np.maximum(0, np.maximum(low - y, y - high)) / size, _WIDEST)
+
+
+def _toward(place: float, smallest: float, growth: float = _TO_LIMIT) -> Size:
+    return lambda y: smallest + growth * np.abs(y - place)
+
+
+def _face(setting: Setting, low: Array, high: Array, axis: int, place: float) -> Array:
+    """Points of a face within the range of the other coordinates, shape (n, points)."""
+    n = setting.dimension
+    lines = [np.linspace(max(low[k], setting.range[0, k]), min(high[k], setting.range[1, k]), _ALONG) for k in range(n)]
+    lines[axis] = np.array([place])
+    return np.array([m.ravel() for m in np.meshgrid(*lines, indexing="ij")])
+
+
+def _layer(setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cell: float) -> float:
+    inward = np.maximum((1 - 2 * side) * f, 1e-300)
+    width = float(np.min(a / (_LAYER * inward)))
+    return max(min(width, cell), _SMALLEST * cell)
+
+
+def _graze(
+    setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cells: Array, sizes: list[list[Size]],
+    place: float,
+) -> list[Grazing]:  # fmt: skip
+    """Refine toward a noise-free limit and about the surface on it where the flow turns."""
+    if not f.min() < 0 < f.max():
+        return []
+    n = setting.dimension
+    near = np.abs(f) <= np.quantile(np.abs(f), max(0.03, 2.0 / len(f)))
+    chosen = points[:, near]
+    slopes = np.zeros((n, chosen.shape[1]))
+    for k in range(n):
+        if k != axis:
+            moved = chosen.copy()
+            moved[k] += 1e-5 * cells[k]
+            slopes[k] = (setting.flow(moved)[axis] - setting.flow(chosen)[axis]) / (1e-5 * cells[k])
+    mean = np.abs(slopes).mean(axis=1)
+    noise = float(np.mean(np.einsum("ip,ijp,jp->p", slopes, a[:, :, near], slopes)))
+    speed = 0.5 * float(np.max(mean * cells))
+    if speed <= 0:
+        return []
+    scale = float(np.clip(speed**3 / max(noise, 1e-300), 1e-6 * cells[axis], 0.5 * cells[axis]))
+    sizes[axis].append(_toward(place, scale, _TO_FREE))
+    steep = np.flatnonzero(mean > 1e-9 * mean.max())
+    if len(steep) == 1:
+        k = int(steep[0])
+        middle = float(np.mean(chosen[k] - f[near] / slopes[k]))
+        sizes[k].append(_toward(middle, speed / mean[k], _ABOUT))
+    return [Grazing(axis=axis, side=side, speed=speed, scale=scale)]
+
+
+def _nodes(low: float, high: float, sizes: list[Size]) -> Array:
+    """Nodes whose distances follow the least of the sizes."""
+    y = np.linspace(low, high, _FINE)
+    density = 1 / np.min([size(y) for size in sizes], axis=0)
+    count = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * (y[1] - y[0]))])
+    cells = max(int(np.ceil(count[-1])), 8)
+    nodes = np.interp(np.linspace(0, count[-1], cells + 1), count, y)
+    nodes[0], nodes[-1] = low, high
+    return nodes

@@ -1,0 +1,260 @@
+"""u, and the error that the process carries: one function v a side with v_t + L v <= eta (Thm K10, 10.1 and 10.2).
+
+From above v is the bound itself, u + e; from below v is its negative, -(u - e). On both sides v_t + sup_d L^d v <= eta
+is asked where v < ``end`` (1 from above, 0 from below), v >= ``goal`` wherever paths can leave (from above 1; from
+below -1 at limits and 0 at other ends of the box), and v(T) >= 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from certbound.arrays import Array, Mask
+from certbound.rigor.intervals import Interval
+from certbound.values.backward.axes import Grazing, plan_axes
+from certbound.values.backward.exits import Face, face_of, shortfall
+from certbound.values.backward.residual import Generator, residual_bound
+from certbound.values.backward.setting import Setting
+from certbound.values.backward.solve import Discretised, discretised
+from certbound.values.backward.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
+
+END = 0.004  # of the horizon: the layer at its end
+_FIRST, _GROWTH = 12, 1.3  # steps within that layer, and how they grow
+_MARGIN = 0.1  # by which a source exceeds what it pays for
+_STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
+_SOFT = 3.0
+_KILL = 10.0
+_REACHED = 1.5
+_BATCH = 20000
+
+
+def ramp(y: Array) -> Array:
+    """A C^2 step from 0 at 0 to 1 at 1."""
+    z = np.clip(y, 0, 1)
+    return np.asarray(z**3 * (10 - 15 * z + 6 * z * z))
+
+
+def time_steps(horizon: float, count: int) -> Array:
+    """Lengths of the steps from the end backward: small in the end layer, growing to horizon / count."""
+    largest, step, result = horizon / count, END * horizon / _FIRST, []
+    while step < largest and sum(result) + step < horizon:
+        result.append(step)
+        step *= _GROWTH
+    rest = horizon - sum(result)
+    more = max(int(np.ceil(rest / largest)), 1)
+    return np.array(result + [rest / more] * more)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Mesh:
+    """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis)."""
+
+    nodes: tuple[Array, ...]
+    pad: tuple[tuple[int, int], ...]
+    points: Array
+    equation: Discretised
+    layer: Array
+    at_limit: Mask
+    rate: Array
+
+
+def extended(nodes: Array, before: int, behind: int) -> Array:
+    """The nodes, and their mirror images beyond both ends."""
+    low = 2 * nodes[0] - nodes[before:0:-1] if before else nodes[:0]
+    high = 2 * nodes[-1] - nodes[-2 : -2 - behind : -1] if behind else nodes[:0]
+    return np.concatenate([low, nodes, high])
+
+
+def mesh_of(
+    setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool
+) -> Mesh:
+    """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones."""
+    n = setting.dimension
+    low, high = setting.low[row], setting.high[row]
+    free = {(one.axis, one.side) for one in grazing}
+    pads = tuple(
+        tuple(pad[0] if (i, side) in free else pad[1] for side in (0, 1))
+        for i in range(n)
+    )
+    lines = tuple(extended(nodes[i], *pads[i]) for i in range(n))
+    points = np.array(np.meshgrid(*lines, indexing="ij"))
+    shape = points.shape[1:]
+    inside = np.clip(points, low.reshape(-1, *[1] * n), high.reshape(-1, *[1] * n))
+    flow, spread = setting.flow(inside), setting.spread(inside).reshape(n, n, *shape)
+    dead, at_limit, layer, rate = np.zeros(shape, bool), np.zeros(shape, bool), np.ones(shape), np.zeros(shape)
+    span = END * setting.horizon
+    for i in range(n):
+        for side, place in ((0, 0), (1, shape[i] - 1)):
+            face = tuple(place if k == i else slice(None) for k in range(n))
+            out = (2 * side - 1) * flow[i][face]
+            leaves = (spread[i, i][face] > 0) | (out >= 0)
+            dead[face] |= leaves
+            at_limit[face] |= leaves & bool(setting.limited[side, i])
+            width = np.sqrt(spread[i, i][face].max() * span) or np.maximum(out, 0).mean() * span
+            third = abs(lines[i][place] - lines[i][3 if side == 0 else -4])
+            layer = layer * ramp(np.abs(points[i] - lines[i][place]) / max(width, third))
+    for i in range(n):
+        for side in (0, 1):
+            if pads[i][side] and (i, side) not in free:
+                edge = (low, high)[side][i]
+                out = (2 * side - 1) * (points[i] - edge)
+                beyond = abs(lines[i][-1 if side else 0] - edge)
+                speed = np.abs(flow[i]) / beyond + spread[i, i] / beyond**2
+                rate += _KILL * speed * ramp(out / beyond)
+    for one in grazing:
+        edge = (low, high)[one.side][one.axis]
+        out = (2 * one.side - 1) * (points[one.axis] - edge)
+        if pads[one.axis][one.side]:
+            beyond = abs(lines[one.axis][-1 if one.side else 0] - edge)
+            rate += _KILL * np.abs(flow[one.axis]).max() / beyond * ramp(out / beyond)
+        if kill:
+            width = (0.3 * _SOFT**3 + 2) * one.scale
+            rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(flow[one.axis] / (_SOFT * one.speed))
+    layer[dead] = 0
+    return Mesh(nodes=lines, pad=pads, points=points, equation=discretised(lines, flow, spread, dead, rate), layer=layer,
+                at_limit=at_limit, rate=rate)  # fmt: skip
+
+
+def _bump(y: Array) -> Array:
+    return np.asarray(np.exp(-y * y / 2))
+
+
+class Side:
+    """One bound on one grid.
+
+    Parameters
+    ----------
+    setting : Setting
+    cell : float
+        Width of a cell as a share of the range.
+    steps : int
+        Steps over the horizon.
+    above : bool
+        From above or from below.
+    """
+
+    def __init__(self, setting: Setting, cell: float, steps: int, above: bool, parts: int | None = None) -> None:
+        self.setting, self.above = setting, above
+        row = 0 if above else 1
+        nodes, grazing = plan_axes(setting, cell, row)
+        self.axes = tuple(Axis(line, Sampling(parts or (4 if len(nodes) < 3 else 2))) for line in nodes)
+        self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above)
+        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False)
+        self.steps = time_steps(setting.horizon, steps)
+        everywhere = Interval.point(0.0)
+        self.generator = Generator.of(
+            self.axes, setting.drift.on(self.axes, everywhere), setting.square.on(self.axes, everywhere)
+        )
+        self.maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.mesh.nodes)]
+        self.carried_maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.carrier.nodes)]
+        n, noisy = setting.dimension, setting.noisy
+        self.faces = [
+            face_of(self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])))
+            for i in range(n) for side in (0, 1)
+        ]
+        self.values: list[Array] = []
+        self.rates: list[Array] = []
+
+    def _goal(self, limit: bool) -> float:
+        return 1.0 if self.above else -1.0 if limit else 0.0
+
+    def shortfalls(self) -> list[Array]:
+        """What v lacks at every face where paths can leave, shapes (slabs, face cells)."""
+        values, rates = np.array(self.values), np.array(self.rates)
+        return [shortfall(self.axes, face, values, rates, self.steps) for face in self.faces]
+
+    def shortfall_at_end(self) -> Array:
+        """What v(T) lacks of 0 on every cell."""
+        return np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0)
+
+    def propose(self) -> None:
+        """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
+        equation, span = self.mesh.equation, END * self.setting.horizon
+        above, limit = self.above, self.mesh.at_limit
+
+        def fall(tau: float) -> Array | float:
+            if above or tau >= span:
+                return 0.0
+            return -30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit
+
+        a = self.mesh.layer.copy() if above else np.ones(equation.shape)
+        tau = 0.0
+        self._keep(a, equation.speed(a, 0.0, fall(tau)))
+        for step in self.steps:
+            a = equation.step(a, step, lambda part: 0.0, lambda part, tau=tau, step=step: fall(tau + part * step))
+            tau += step
+            self._keep(a, equation.speed(a, 0.0, fall(tau)))
+
+    def _keep(self, a: Array, speed: Array) -> None:
+        sign = -1.0 if self.above else 1.0
+        self.values.append(sign * (apply_dense(self.maps, a) - 1))
+        self.rates.append(-sign * apply_dense(self.maps, speed))
+
+    def residuals(self) -> list[Array]:
+        """A bound of v_t + L v on every cell, slab by slab from the end backward."""
+        cells = int(np.prod([axis.cells for axis in self.axes]))
+        many = max(1, _BATCH // cells)
+        result: list[Array] = []
+        for begin in range(0, len(self.steps), many):
+            end = min(begin + many, len(self.steps))
+            knots = [np.array(rows[begin : end + 1]) for rows in (self.values, self.rates)]
+            bound = residual_bound(self.generator, knots[0], knots[1], self.steps[begin:end])
+            result += list(np.where(self._decided(*knots, self.steps[begin:end]), 0.0, np.maximum(bound, 0.0)))
+        return result
+
+    def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:
+        """Cells and slabs on which v is so large that nothing is asked of it any more."""
+        h = steps.reshape(-1, *[1] * len(self.axes)) / 3
+        parts = (values[1:], values[1:] + h * rates[1:], values[:-1] - h * rates[:-1], values[:-1])
+        lowest = np.minimum.reduce(parts)
+        for axis in range(len(self.axes)):
+            lowest = -sliding_max(-lowest, axis + 1, DEGREE + 1)
+        return np.asarray(lowest >= (1.0 if self.above else 0.0) + 1e-12)
+
+    def correct(self, residuals: list[Array]) -> None:
+        """Solve for the error that the residuals leave, and for what v lacks at exits and at the end; add it to v."""
+        equation = self.carrier.equation
+        slabs = [self._spread(r) + b for r, b in zip(residuals, self._at_exits())]
+        ends = [slabs[0], *(np.maximum(p, q) for p, q in zip(slabs, slabs[1:])), slabs[-1]]
+        ends = [(1 + _MARGIN) * s * equation.live for s in ends]
+        missing = (1 + _MARGIN) * self._spread(self.shortfall_at_end()) * equation.live
+        e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
+        self._add(0, e, equation.speed(e, ends[0]))
+        for k, step in enumerate(self.steps):
+            begin, end = ends[k], ends[k + 1]
+            e = equation.step(e, step, lambda part, p=begin, q=end: (1 - part) * p + part * q, lambda part: 0.0)
+            self._add(k + 1, e, equation.speed(e, end))
+
+    def _at_exits(self) -> list[Array]:
+        """Sources beyond the faces, from which e takes what v lacks there, slab by slab."""
+        total = [np.zeros(self.carrier.equation.shape) for _ in self.steps]
+        for face, missing in zip(self.faces, self.shortfalls()):
+            pad = self.carrier.pad[face.axis][face.side]
+            if not pad or not missing.any():
+                continue
+            length = self.carrier.equation.shape[face.axis]
+            beyond = slice(length - pad, length) if face.side else slice(0, pad)
+            place = tuple(beyond if k == face.axis else slice(None) for k in range(len(self.axes)))
+            for k, one in enumerate(missing):
+                if one.any():
+                    around = self._spread(np.expand_dims(one, face.axis), skip=face.axis)
+                    total[k][place] = np.maximum(total[k][place], _REACHED * around * self.carrier.rate[place])
+        return total
+
+    def _add(self, k: int, e: Array, speed: Array) -> None:
+        self.values[k] = self.values[k] + apply_dense(self.carried_maps, e)
+        self.rates[k] = self.rates[k] - apply_dense(self.carried_maps, speed)
+
+    def _spread(self, cells: Array, skip: int | None = None) -> Array:
+        """A smooth source on the carrier's nodes above what is asked for on the cells."""
+        for axis, (before, behind) in enumerate(self.carrier.pad):
+            if axis != skip:
+                around = [(before + 1, behind + 1) if k == axis else (0, 0) for k in range(cells.ndim)]
+                moved = np.moveaxis(np.pad(cells, around), axis, 0)
+                cells = np.moveaxis(np.maximum(moved[1:], moved[:-1]), 0, axis)
+        size = [1 if axis == skip else 3 for axis in range(cells.ndim)]
+        return np.asarray(uniform_filter(maximum_filter(cells, size), size))

@@ -1,0 +1,209 @@
+"""The door: certified bounds of the probability of failing by a solution whose error the process carries (Thm K10)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from certbound.arrays import Array
+from certbound.errors import InfeasibleError
+from certbound.problem.problem import Problem
+from certbound.problem.sets import GaussianStart
+from certbound.values.backward.carry import Side
+from certbound.values.backward.setting import Setting, setting_of
+from certbound.values.backward.splines import Derivatives, unit
+from certbound.watch import poll
+
+_COARSEST = {2: 0.06, 3: 0.1}  # cell of the first run, as a share of the range: a second a side
+_STEPS = 1.8  # cells of the range a step: errors in space and in time are about alike then
+_PASSES = 8
+_CLOSE = 1.02  # ratio of the bounds that ends the search
+_PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
+_GROWTH = 6.0  # the largest factor of work from one run to the next
+_STARTS = 9  # points along each side of a start set
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Bounds:
+    """Certified bounds of the probability of failing from the worst start.
+
+    Attributes
+    ----------
+    lower, upper : float
+    cells : tuple of int
+        Of the grid of the better of the two.
+    steps : int
+    runs : int
+        Grids that were tried.
+    estimate : float
+        The probability by the numerical solution; nothing is proved of it.
+    seconds : float
+    """
+
+    lower: float
+    upper: float
+    cells: tuple[int, ...]
+    steps: int
+    runs: int
+    estimate: float
+    seconds: float
+
+
+def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0) -> Iterator[Bounds]:
+    """Bound P(X_t leaves the safe set for some t <= T) from both sides, on finer and finer grids (Thm K10).
+
+    Parameters
+    ----------
+    problem : Problem
+        Continuous time, two or three states, limits along the coordinates; any noise.
+    seconds : float
+        How long to refine; the first grid is finished in any case.
+    delta : float
+        Where the numerical solution says on which side of ``delta`` the answer lies, only the bound that shows it is
+        looked for; 0 for both.
+
+    Yields
+    ------
+    Bounds
+        The best of all grids so far.
+
+    Raises
+    ------
+    InfeasibleError
+        The problem is not of this kind; the message says why.
+    EnclosureError
+        The model is undefined somewhere in the safe set.
+    """
+    setting = setting_of(problem)
+    if setting.dimension not in _COARSEST:
+        raise InfeasibleError("values with a carried error serve two and three states here.")
+    begin, starts = time.perf_counter(), _starts(problem)
+    cell, best, runs = _COARSEST[setting.dimension], (0.0, 1.0), 0
+    while True:
+        started = time.perf_counter()
+        count, cells, estimate = math.ceil(_STEPS / cell), (), 0.0
+        wanted = [True, False]
+        while wanted:
+            above = wanted.pop(0)
+            side = Side(setting, np.full(setting.dimension, cell), count, above)
+            side.propose()
+            estimate = abs(largest_at_start(side, starts)[0])
+            if above and delta > 0:
+                above_is_enough, below_is_enough = estimate < delta, estimate > delta
+                if below_is_enough and best[1] <= 1 and runs > 0:
+                    continue
+                if above_is_enough and runs > 0:
+                    wanted = []
+            bound = refined(side, starts)
+            best = (best[0], min(best[1], bound)) if above else (max(best[0], -bound), best[1])
+            cells = tuple(axis.cells for axis in side.axes)
+        runs += 1
+        spent = time.perf_counter() - started
+        left = seconds - (time.perf_counter() - begin)
+        yield Bounds(lower=max(best[0], 0.0), upper=min(best[1], 1.0), cells=cells, steps=count, runs=runs,
+                     estimate=estimate, seconds=time.perf_counter() - begin)  # fmt: skip
+        if best[1] <= _CLOSE * best[0] or left <= 1.2 * spent:
+            return
+        work = min(_GROWTH, 0.7 * left / spent)
+        cell /= max(work, 1.3) ** (1 / (setting.dimension + 1))
+
+
+def refined(side: Side, starts: Starts) -> float:
+    """The bound of one side: passes of the carried error until what is left of the residual is paid at once."""
+    best = math.inf
+    for k in range(_PASSES):
+        poll("solving for the error that is left")
+        residuals = side.residuals()
+        left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
+        missing = max([float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls())])
+        value = largest_at_start(side, starts)[1]
+        total = (value + (left + missing) * (1 + 1e-9)) + 1e-15
+        best = min(best, total)
+        end = 1.0 if side.above else 0.0
+        if left + missing <= _PAID * abs(value) or value >= end or k == _PASSES - 1:
+            break
+        side.correct(residuals)
+    return best
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Starts:
+    """Boxes around the starts, and points that surely are starts, shapes (S, n) and (P, n)."""
+
+    low: Array
+    high: Array
+    points: Array
+
+
+def _starts(problem: Problem) -> Starts:
+    lows, highs, points = [], [], []
+    for start in problem.starts:
+        if isinstance(start, GaussianStart):
+            raise InfeasibleError("values with a carried error do not serve random starts yet.")
+        hull = start.hull(0.0)
+        low, high = np.asarray(hull.lo, dtype=float), np.asarray(hull.hi, dtype=float)
+        lows.append(low)
+        highs.append(high)
+        middle = np.asarray(start.middle, dtype=float)
+        shares = product(*([0.0] if a == b else np.linspace(-1, 1, 5) for a, b in zip(low, high)))
+        for share in shares:
+            point = middle + np.array(share) * (high - low) / 2 * (1 - 1e-9)
+            if start.contains(point):
+                points.append(point)
+    return Starts(low=np.array(lows), high=np.array(highs), points=np.array(points))
+
+
+def largest_at_start(side: Side, starts: Starts) -> tuple[float, float]:
+    """v(0, .) over the starts: roughly at the worst of them, and the certified number of the side.
+
+    From above that is an upper bound over all starts; from below the least of v over some of them, rounded up.
+    """
+    coefficients = side.values[-1]
+    if not side.above:
+        values = [_value(side, coefficients, point) for point in starts.points]
+        low = min(values)
+        return low, low + _rounding(coefficients)
+    best, rough = -math.inf, -math.inf
+    derivatives = Derivatives(side.axes, coefficients[None])
+    n = len(side.axes)
+    for low, high in zip(starts.low, starts.high):
+        lines = [np.unique(np.linspace(a, b, _STARTS if a < b else 1)) for a, b in zip(low, high)]
+        values = coefficients
+        for k, (axis, line) in enumerate(zip(side.axes, lines)):
+            values = axis.at_points(line, 0).along(values, k)
+        most = float(values.max())
+        extra = 0.0
+        for k, line in enumerate(lines):
+            if len(line) > 1:
+                size = _over_box(side, derivatives.size(unit(k, n, 2))[0], low, high)
+                extra += float(np.diff(line).max()) ** 2 / 8 * size * (1 + 1e-9)
+        rough, best = max(rough, most), max(best, most + extra + _rounding(coefficients))
+    return rough, best
+
+
+def _over_box(side: Side, cells: Array, low: Array, high: Array) -> float:
+    """The largest of the values of the cells that meet a box."""
+    places = []
+    for axis, a, b in zip(side.axes, low, high):
+        first = max(int(np.searchsorted(axis.nodes, a, side="left")) - 1, 0)
+        last = min(int(np.searchsorted(axis.nodes, b, side="right")), axis.cells)
+        places.append(slice(first, max(last, first + 1)))
+    return float(cells[tuple(places)].max())
+
+
+def _value(side: Side, coefficients: Array, point: Sequence[float] | Array) -> float:
+    for k, (axis, place) in enumerate(zip(side.axes, point)):
+        coefficients = axis.at_points(np.array([place]), 0).along(coefficients, k)
+    return float(coefficients.reshape(()))
+
+
+def _rounding(coefficients: Array) -> float:
+    return 1e-13 * float(np.abs(coefficients).max())
+
+
+__all__ = ["Bounds", "Setting", "bound_failing"]

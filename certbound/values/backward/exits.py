@@ -1,0 +1,66 @@
+"""Where paths can leave a box, and by how much v falls short of what is asked of it there (Thm K10, 10.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.arrays import Array, Mask
+from certbound.rigor.intervals import Interval
+from certbound.values.backward.coefficients import Fields
+from certbound.values.backward.splines import Axis, most_on_cells
+from certbound.values.continuous.coefficients import enclose
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Face:
+    """One end of a box along an axis.
+
+    Attributes
+    ----------
+    axis, side : int
+        Which coordinate, and whether its lower (0) or upper (1) end.
+    leaves : ndarray of bool, shape (N_1, ...) without that axis
+        Face cells through which a path may leave: noise crosses, or the drift points outward or along the face.
+    goal : float
+        What is asked of v there.
+    """
+
+    axis: int
+    side: int
+    leaves: Mask
+    goal: float
+
+
+def face_of(axes: Sequence[Axis], drift: Fields, noisy: bool, axis: int, side: int, goal: float) -> Face:
+    """The face, with the cells where paths can leave by outward-rounded enclosures of the drift."""
+    others = [one for k, one in enumerate(axes) if k != axis]
+    shape = tuple(one.cells for one in others)
+    if noisy:
+        return Face(axis=axis, side=side, leaves=np.ones(shape, dtype=bool), goal=goal)
+    place = axes[axis].nodes[-side]
+    ends = [(one.nodes[:-1], one.nodes[1:]) for one in others]
+    lows, highs = (np.meshgrid(*rows, indexing="ij", sparse=True) for rows in zip(*ends))
+    boxes = [Interval(low, high) for low, high in zip(lows, highs)]
+    boxes.insert(axis, Interval.point(place))
+    values, _ = enclose(drift.tape, [Interval.point(0.0), *boxes])
+    across = values[axis].broadcast_to(shape)
+    leaves = across.hi >= 0 if side else across.lo <= 0
+    return Face(axis=axis, side=side, leaves=np.asarray(leaves), goal=goal)
+
+
+def shortfall(axes: Sequence[Axis], face: Face, values: Array, rates: Array, steps: Array) -> Array:
+    """goal - v, at least 0, on every face cell where paths can leave; shape (slabs, face cells).
+
+    v lies above the least Bernstein coefficient, in space and time, of each face cell and slab.
+    """
+    others = tuple(one for k, one in enumerate(axes) if k != face.axis)
+    layer = -1 if face.side else 0
+    v, d = (np.take(rows, layer, axis=face.axis + 1) for rows in (values, rates))
+    h = steps.reshape(-1, *[1] * (v.ndim - 1)) / 3
+    parts = (v[1:], v[1:] + h * d[1:], v[:-1] - h * d[:-1], v[:-1])
+    most = np.maximum.reduce([most_on_cells(others, -part) for part in parts])
+    missing = (face.goal + most) * (1 + 1e-12) + 1e-15
+    return np.where(face.leaves, np.maximum(missing, 0.0), 0.0)

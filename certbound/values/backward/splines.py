@@ -1,0 +1,426 @@
+"""Quintic splines on graded axes: linear maps along one axis, and how tensors of any dimension are mapped by them.
+
+An axis has nodes z_0 < ... < z_N. Its splines are C^4, of degree 5, with a simple knot at every inner node and clamped
+ends: N + 5 coefficients. The *lattice* of an axis is the points at which its cells are sampled, nodes among them. Whatever
+proposes a spline, the spline is its coefficients: the proofs read these alone.
+
+Proved of an axis, in exact arithmetic: on cell c the k-th derivative lies between the least and the largest of its
+control values c, ..., c + 5 - k (the convex hull of B-splines); its first and last coefficient are its values at the
+ends. Every entry of a matrix here is computed from sums of products of like sign, or differences of these, with an
+error of at most `ROUNDOFF` of the sum of magnitudes in its row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from math import factorial
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+
+from certbound.arrays import Array, Index
+from certbound.lazy import compiled
+from certbound.values.continuous.polynomials import lebesgue, nodes_of, to_bernstein
+
+DEGREE = 5
+ROUNDOFF = 200 * 2.0**-53
+"""Relative error of a derivative at a lattice point against the sum of the magnitudes of its terms: fewer than 200
+roundings lie on the way from a coefficient to a value (six of de Boor's recursion an axis, products and sums)."""
+
+
+_MANY = 64 * 2.0**-53
+"""Relative error of a control value against the sum of the magnitudes of its terms: three roundings a difference."""
+
+
+@compiled
+def _banded(out, values, start, weights):  # type: ignore[no-untyped-def]
+    """out[p, j, q] = sum_k weights[j, k] values[p, start[j] + k, q]."""
+    if values.shape[2] == 1:
+        for p in range(values.shape[0]):
+            for j in range(start.size):
+                total = 0.0
+                for k in range(weights.shape[1]):
+                    total += weights[j, k] * values[p, start[j] + k, 0]
+                out[p, j, 0] = total
+        return
+    for p in range(values.shape[0]):
+        for j in range(start.size):
+            row = out[p, j]
+            first = values[p, start[j]]
+            w = weights[j, 0]
+            for q in range(row.size):
+                row[q] = w * first[q]
+            for k in range(1, weights.shape[1]):
+                w = weights[j, k]
+                if w != 0.0:
+                    other = values[p, start[j] + k]
+                    for q in range(row.size):
+                        row[q] += w * other[q]
+
+
+@compiled
+def _largest(out, values, count, stride):  # type: ignore[no-untyped-def]
+    """out[p, j, q] = max of values[p, stride j + k, q] over k < count."""
+    if values.shape[2] == 1:
+        for p in range(out.shape[0]):
+            line, given = out[p, :, 0], values[p, :, 0]
+            for j in range(line.size):
+                line[j] = given[stride * j]
+            for k in range(1, count):
+                for j in range(line.size):
+                    line[j] = max(line[j], given[stride * j + k])
+        return
+    for p in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            row = out[p, j]
+            first = values[p, stride * j]
+            for q in range(row.size):
+                row[q] = first[q]
+            for k in range(1, count):
+                other = values[p, stride * j + k]
+                for q in range(row.size):
+                    if other[q] > row[q]:
+                        row[q] = other[q]
+
+
+@compiled
+def _combined(out, values, rows, stride):  # type: ignore[no-untyped-def]
+    """out[p, c, q] = the largest of 0 and sum_k rows[r, k] values[p, stride c + k, q] over r."""
+    if values.shape[2] == 1:
+        for p in range(out.shape[0]):
+            for c in range(out.shape[1]):
+                best = 0.0
+                for r in range(rows.shape[0]):
+                    sum_ = 0.0
+                    for k in range(rows.shape[1]):
+                        sum_ += rows[r, k] * values[p, stride * c + k, 0]
+                    best = max(best, sum_)
+                out[p, c, 0] = best
+        return
+    total = np.empty(out.shape[2])
+    for p in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            row = out[p, c]
+            for q in range(row.size):
+                row[q] = 0.0
+            for r in range(rows.shape[0]):
+                w = rows[r, 0]
+                first = values[p, stride * c]
+                for q in range(row.size):
+                    total[q] = w * first[q]
+                for k in range(1, rows.shape[1]):
+                    w = rows[r, k]
+                    other = values[p, stride * c + k]
+                    for q in range(row.size):
+                        total[q] += w * other[q]
+                for q in range(row.size):
+                    if total[q] > row[q]:
+                        row[q] = total[q]
+
+
+def _split(shape: tuple[int, ...], axis: int) -> tuple[int, int, int]:
+    return int(np.prod(shape[:axis])), shape[axis], int(np.prod(shape[axis + 1 :]))
+
+
+def thin(array: Array, axis: int) -> Array:
+    """A tensor as (before, along, behind)."""
+    before, along, behind = _split(array.shape, axis)
+    return np.ascontiguousarray(array).reshape(before, along, behind)
+
+
+def back(out: Array, shape: tuple[int, ...], axis: int) -> Array:
+    """A result of that form as a tensor."""
+    return out.reshape((*shape[:axis], out.shape[1], *shape[axis + 1 :]))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Banded:
+    """A matrix whose row j has its entries from column ``start[j]`` on: shapes (rows,) and (rows, width)."""
+
+    start: Index
+    weights: Array
+
+    def along(self, values: Array, axis: int) -> Array:
+        """Map a tensor along one axis."""
+        given = thin(values, axis)
+        out = np.empty((given.shape[0], len(self.start), given.shape[2]))
+        _banded(out, given, self.start, self.weights)
+        return back(out, values.shape, axis)
+
+    def absolute(self) -> Array:
+        """Sum of the magnitudes of each row, shape (rows,)."""
+        return np.asarray(np.abs(self.weights).sum(axis=1))
+
+
+def sliding_max(values: Array, axis: int, count: int, stride: int = 1) -> Array:
+    """The largest of ``count`` neighbours along an axis, every ``stride``-th."""
+    given = thin(values, axis)
+    out = np.empty((given.shape[0], (given.shape[1] - count) // stride + 1, given.shape[2]))
+    _largest(out, given, count, stride)
+    return back(out, values.shape, axis)
+
+
+def cell_combinations(values: Array, axis: int, rows: Array) -> Array:
+    """Of lattice values along an axis: on every cell the largest of 0 and of what each of the rows makes of them."""
+    given = thin(values, axis)
+    stride = rows.shape[1] - 1
+    out = np.empty((given.shape[0], given.shape[1] // stride, given.shape[2]))
+    _combined(out, given, np.ascontiguousarray(rows), stride)
+    return back(out, values.shape, axis)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sampling:
+    """How a cell is sampled along an axis: ``parts`` + 1 points, and the polynomial of degree ``parts`` through them.
+
+    The points are those of `nodes_of`, near Chebyshev's extremal ones. In units of the cell's width:
+
+    Attributes
+    ----------
+    parts : int
+        Degree of the interpolant, 2 to 4.
+    """
+
+    parts: int
+
+    @property
+    def nodes(self) -> Array:
+        """Shares of the cell, 0 and 1 among them."""
+        return np.array(nodes_of(self.parts + 1))
+
+    @property
+    def lebesgue(self) -> float:
+        """Bound of the interpolant where the samples are at most 1 in size."""
+        return lebesgue(self.parts + 1)
+
+    @property
+    def tail(self) -> float:
+        """Error of the interpolant for a derivative of order ``parts + 1`` of size 1."""
+        return _node_product(self.parts + 1) / factorial(self.parts + 1)
+
+    @property
+    def chord(self) -> float:
+        """Distance of a function with second derivative -1 from its chords between the points: gap^2 / 8."""
+        return float(np.diff(self.nodes).max()) ** 2 / 8
+
+    def derivative(self, order: int) -> Array:
+        """From samples to the Bernstein coefficients of the interpolant's derivative."""
+        return _derivative(self.parts, order)
+
+
+@lru_cache(maxsize=16)
+def _node_product(count: int) -> float:
+    """An upper bound of max |(s - s_1) ... (s - s_count)| over [0, 1]."""
+    points = np.linspace(0, 1, 2**17 + 1)
+    sizes = np.abs(points[:, None] - np.array(nodes_of(count))).prod(axis=1)
+    return float(sizes.max()) + count / 2**18  # |derivative| <= count: half a spacing to the nearest point
+
+
+@lru_cache(maxsize=32)
+def _derivative(parts: int, order: int) -> Array:
+    rows = to_bernstein(parts + 1)
+    for k in range(order):
+        rows = (parts - k) * np.diff(rows, axis=0)
+    return np.ascontiguousarray(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """Splines over the nodes of one axis.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (N + 1,)
+        Rising; at least 7.
+    sampling : Sampling
+        How its cells are sampled.
+    """
+
+    nodes: Array
+    sampling: Sampling
+
+    @property
+    def cells(self) -> int:
+        """N."""
+        return len(self.nodes) - 1
+
+    @cached_property
+    def knots(self) -> Array:
+        """The clamped knots, shape (N + 11,)."""
+        return np.concatenate([[self.nodes[0]] * DEGREE, self.nodes, [self.nodes[-1]] * DEGREE])
+
+    @cached_property
+    def lattice(self) -> Array:
+        """The points at which cells are sampled, shape (parts N + 1,)."""
+        inner = self.nodes[:-1, None] + np.diff(self.nodes)[:, None] * self.sampling.nodes[:-1]
+        return np.append(inner.ravel(), self.nodes[-1])
+
+    @cached_property
+    def widths(self) -> Array:
+        """Widths of the cells, rounded up, shape (N,)."""
+        return np.diff(self.nodes) * (1 + 1e-15)
+
+    def at_points(self, points: Array, order: int) -> Banded:
+        """The ``order``-th derivative at points, from the coefficients."""
+        count = self.cells + DEGREE
+        place = np.clip(np.searchsorted(self.nodes, points, side="right") - 1, 0, self.cells - 1)
+        values = BSpline(self.knots, np.eye(count), DEGREE)
+        full = (values.derivative(order) if order else values)(points)
+        columns = place[:, None] + np.arange(DEGREE + 1)
+        return Banded(place.astype(np.intp), np.ascontiguousarray(np.take_along_axis(full, columns, axis=1)))
+
+    @cached_property
+    def on_lattice(self) -> tuple[Banded, Banded, Banded]:
+        """Values, first and second derivatives on the lattice."""
+        first, second, third = (self.at_points(self.lattice, order) for order in range(3))
+        return first, second, third
+
+    @cached_property
+    def bernstein(self) -> Banded:
+        """The Bernstein coefficients of degree 5 on each cell, six rows a cell."""
+        count = DEGREE + 1
+        inner = np.array(nodes_of(count))
+        points = self.nodes[:-1, None] + np.diff(self.nodes)[:, None] * inner
+        values = BSpline(self.knots, np.eye(self.cells + DEGREE), DEGREE)
+        place = np.repeat(np.arange(self.cells), count)
+        full = np.take_along_axis(values(points.ravel()), place[:, None] + np.arange(count), axis=1)
+        weights = np.einsum("jk,ckm->cjm", to_bernstein(count), full.reshape(self.cells, count, count))
+        return Banded(place.astype(np.intp), np.ascontiguousarray(weights.reshape(-1, count)))
+
+    def differences(self, order: int) -> Banded:
+        """From control values of the (order - 1)-th derivative to those of the order-th."""
+        knots = self.knots[order : len(self.knots) - order]
+        degree = DEGREE - order
+        gaps = knots[degree + 1 :] - knots[: -degree - 1]
+        scale = (degree + 1) / gaps[: self.cells + degree]
+        return Banded(np.arange(len(scale)), np.ascontiguousarray(np.stack([-scale, scale], axis=1)))
+
+    @cached_property
+    def differentiate(self) -> tuple[Banded, ...]:
+        """`differences` of orders 1 to 5."""
+        return tuple(self.differences(order) for order in range(1, DEGREE + 1))
+
+    @cached_property
+    def condition(self) -> tuple[Array, Array, Array]:
+        """Per cell, the largest row sum of magnitudes on its lattice points, of each of `on_lattice`; shapes (N,).
+
+        Where a lattice point is rounded, the sum grows by the share of a cell that this moves it.
+        """
+        sums = [one.absolute() for one in self.on_lattice]
+        moved = 1 + np.maximum(np.abs(self.nodes[1:]), np.abs(self.nodes[:-1])) / self.widths
+        first, second, third = (moved * sliding_max(row, 0, self.sampling.parts + 1, self.sampling.parts) for row in sums)
+        return first, second, third
+
+    @cached_property
+    def rounding(self) -> tuple[Array, ...]:
+        """Per cell and order, how much larger than the coefficients the terms of a derivative's control values are."""
+        result = [np.ones(self.cells)]
+        for order, step in enumerate(self.differentiate, start=1):
+            largest = sliding_max(2.0 * step.weights[:, 1], 0, DEGREE + 1 - order)
+            result.append(result[-1] * largest)
+        return tuple(result)
+
+    def from_nodes(self, nodes: Array | None = None) -> Array:
+        """The matrix from values at ``nodes`` (default: its own) to coefficients, by not-a-knot interpolation.
+
+        ``nodes`` may reach beyond the axis; its part within must be the axis' own. Shape (N + 5, len(nodes)).
+        """
+        nodes = self.nodes if nodes is None else nodes
+        averages = np.array([self.knots[i + 1 : i + DEGREE + 1].mean() for i in range(self.cells + DEGREE)])
+        averages = np.clip(averages, self.nodes[0], self.nodes[-1])
+        values = make_interp_spline(nodes, np.eye(len(nodes)), k=DEGREE)(averages)
+        collocation = BSpline(self.knots, np.eye(len(averages)), DEGREE)(averages)
+        return np.asarray(np.linalg.solve(collocation, values))
+
+
+def apply_dense(matrices: list[Array], values: Array) -> Array:
+    """Map a tensor by one dense matrix an axis."""
+    for axis, matrix in enumerate(matrices):
+        values = np.moveaxis(np.tensordot(matrix, values, axes=(1, axis)), 0, axis)
+    return np.ascontiguousarray(values)
+
+
+class Derivatives:
+    """Control values of the partial derivatives of tensor splines, each computed once.
+
+    Parameters
+    ----------
+    axes : sequence of Axis
+    coefficients : ndarray, shape (B, N_1 + 5, ..., N_n + 5)
+        Of B splines.
+    """
+
+    def __init__(self, axes: tuple[Axis, ...], coefficients: Array) -> None:
+        self.axes = axes
+        self.controls = {(0,) * len(axes): coefficients}
+        self.sizes: dict[tuple[int, ...], Array] = {}
+
+    def control(self, orders: tuple[int, ...]) -> Array:
+        """Control values of the derivative of these orders."""
+        if orders not in self.controls:
+            axis = max(range(len(orders)), key=lambda k: (orders[k] > 0, k))
+            lower = tuple(order - (k == axis) for k, order in enumerate(orders))
+            step = self.axes[axis].differentiate[orders[axis] - 1]
+            self.controls[orders] = step.along(self.control(lower), axis + 1)
+        return self.controls[orders]
+
+    def size(self, orders: tuple[int, ...]) -> Array:
+        """A bound of the magnitude of that derivative on every cell, shape (B, N_1, ..., N_n)."""
+        if orders not in self.sizes:
+            value = np.abs(self.control(orders))
+            for axis, order in enumerate(orders):
+                value = sliding_max(value, axis + 1, DEGREE + 1 - order)
+            if any(orders):
+                factors = [axis.rounding[order] for axis, order in zip(self.axes, orders)]
+                value += outer(factors) * _MANY * self.size((0,) * len(orders))
+            self.sizes[orders] = value
+        return self.sizes[orders]
+
+
+def most_on_cells(axes: tuple[Axis, ...], coefficients: Array) -> Array:
+    """An upper bound of tensor splines on every cell by Bernstein coefficients; shape (B, N_1, ..., N_n)."""
+    value = coefficients
+    for k, axis in enumerate(axes):
+        value = axis.bernstein.along(value, k + 1)
+    for k in range(len(axes)):
+        value = sliding_max(value, k + 1, DEGREE + 1, DEGREE + 1)
+    size = np.abs(coefficients)
+    for k in range(len(axes)):
+        size = sliding_max(size, k + 1, DEGREE + 1)
+    return np.asarray(value + 1e-11 * size)
+
+
+def over_cells(axes: tuple[Axis, ...], lattice: Array, skip: int | None = None) -> Array:
+    """The largest of the lattice values on every cell; the tensor's last axes are those of the grid.
+
+    Along the axis ``skip`` there is one value a cell already.
+    """
+    ahead = lattice.ndim - len(axes)
+    for k, axis in enumerate(axes):
+        if k != skip:
+            lattice = sliding_max(lattice, ahead + k, axis.sampling.parts + 1, axis.sampling.parts)
+    return lattice
+
+
+def cells_of(axes: tuple[Axis, ...]) -> tuple[int, ...]:
+    """Cells along each axis."""
+    return tuple(axis.cells for axis in axes)
+
+
+def outer(factors: list[Array]) -> Array:
+    """Tensor product of vectors."""
+    result = factors[0]
+    for factor in factors[1:]:
+        result = result[..., None] * factor
+    return result
+
+
+def unit(axis: int, dimension: int, times: int = 1) -> tuple[int, ...]:
+    """``times`` in one place."""
+    return tuple(times if k == axis else 0 for k in range(dimension))
+
+
+def plus(*orders: tuple[int, ...]) -> tuple[int, ...]:
+    """Entrywise sum."""
+    return tuple(map(sum, zip(*orders)))
