@@ -146,7 +146,8 @@ class Request:
     what is slow and then seldom decides may be left out. Not ``thorough``: an engine may spare itself, as it is asked
     again where that matters, with the ``details`` of its first answer as ``before``. ``bounded``: some probability
     below 1 is proved, and what has no hope of delta may be left out. ``first``: it may end with the first bound that it
-    finds, and goes on from there when it is asked again. ``at_length``: all the time that is left is its own.
+    finds, and goes on from there when it is asked again. ``effort``: the work that it is asked for, as a multiple of
+    what it does where it is asked alone; it may plan for that much, as whoever asks for more than 1 knows its pace.
     ``below``: a lower bound is all that is wanted, where that is less work; ``above``: an upper one.
     ``found`` takes an answer that holds already while the engine looks for a better one: it stands where time ends the
     search (`certbound.watch`).
@@ -159,11 +160,16 @@ class Request:
     thorough: bool = True
     first: bool = False
     bounded: bool = False
-    at_length: bool = False
+    effort: float = 1.0
     below: bool = False
     above: bool = False
     before: Any = None
     found: Callable[[EngineAnswer], object] = lambda answer: None
+
+    @property
+    def at_length(self) -> bool:
+        """Whether more is asked for than an engine does by itself."""
+        return self.effort > 1
 
 
 SPARED = "not asked, since another engine had answered."
@@ -216,7 +222,7 @@ def is_more_than(log10_lower: float, target: float) -> bool:
 
 def may_decide(answer: EngineAnswer, target: float) -> bool:
     """Whether an engine's bounds are near each other with the target in between, so that more time may decide."""
-    if not answer.applicable or answer.conclusive or answer.log10_lower is None:
+    if not answer.applicable or answer.log10_lower is None:
         return False
     return answer.log10_lower <= math.log10(target) < answer.log10_delta <= answer.log10_lower + _NEAR
 
