@@ -323,7 +323,7 @@ class _Search:
             self._note(name, request, self.watch.spent - begun, ended=False)
             raise
         self.left_at.pop(name, None)
-        if answer.applicable or name not in self.answers:
+        if answer.applicable or name not in self.answers or not self.answers[name].applicable:
             found(answer)
         self._note(name, request, self.watch.spent - begun, ended=True)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 _PART = 0.8  # of the time that is left, for one engine where others wait
 _USED = 0.85  # of the time that is left, which a request is expected to take
 _GROWTH = (1.5, 8.0)  # the least and the largest ratio of an effort to the one before
-_AS_LONG = (1.25, 0.2)  # times the seconds of the request before, and seconds: no more work than that was done
+_AS_LONG = (1.25, 0.02)  # times the seconds of the request before, and seconds: no more work than that was done
 _GAIN = 1e-6  # of log10: a bound that moved by less did not move
 
 
