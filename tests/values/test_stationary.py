@@ -9,7 +9,7 @@ import pytest
 from numpy.polynomial import Chebyshev
 
 import certbound as cb
-from certbound.values.continuous.line import stationary
+from certbound.values.continuous.line import mean_time, stationary
 
 
 def exactly(coefficients: list[Fraction], y: float) -> Fraction:
@@ -59,7 +59,7 @@ def test_ranges_over_cells_hold_between_the_middles() -> None:
         safe=[cb.Inside(cb.Box([-2], [1]))],
         horizon=1,
     )
-    square = stationary._square(problem)
+    square = mean_time.squared_of(problem)
     assert square is not None
     cells = stationary._Cells(problem, square, -2.0, 1.0, 32)
     m = Chebyshev(np.random.default_rng(4).standard_normal(13), domain=[-2, 1])
