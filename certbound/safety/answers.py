@@ -110,6 +110,8 @@ class EngineAnswer:
         Whether no other engine can do much better: slow refinements of others may be left out.
     truncated : bool
         Whether an ellipsoid of starts stands for a random start, whose other values count as failing.
+    effort : float or None
+        The effort that was spent (`Request`), where the engine plans its work; None: what was asked for.
     hoped : float or None
         About log10 of the lower bound that a request from ``below`` would lead to; none was looked for.
     """
@@ -134,6 +136,7 @@ class EngineAnswer:
     details: Any = None
     conclusive: bool = False
     truncated: bool = False
+    effort: float | None = None
     hoped: float | None = None
 
 
@@ -147,7 +150,8 @@ class Request:
     again where that matters, with the ``details`` of its first answer as ``before``. ``bounded``: some probability
     below 1 is proved, and what has no hope of delta may be left out. ``first``: it may end with the first bound that it
     finds, and goes on from there when it is asked again. ``effort``: the work that it is asked for, as a multiple of
-    what it does where it is asked alone; it may plan for that much, as whoever asks for more than 1 knows its pace.
+    what it does where it is asked alone; its pace is known then, so that it plans for just that. None: as much of 1 as
+    the engine itself takes to fit into the time.
     ``below``: a lower bound is all that is wanted, where that is less work; ``above``: an upper one.
     ``found`` takes an answer that holds already while the engine looks for a better one: it stands where time ends the
     search (`certbound.watch`).
@@ -160,7 +164,7 @@ class Request:
     thorough: bool = True
     first: bool = False
     bounded: bool = False
-    effort: float = 1.0
+    effort: float | None = None
     below: bool = False
     above: bool = False
     before: Any = None
@@ -169,7 +173,7 @@ class Request:
     @property
     def at_length(self) -> bool:
         """Whether more is asked for than an engine does by itself."""
-        return self.effort > 1
+        return self.effort is not None and self.effort > 1
 
 
 SPARED = "not asked, since another engine had answered."

@@ -194,7 +194,7 @@ class _Search:
     def _waits(self, name: str, *, patient: bool) -> bool:
         """Whether an engine left something out that is worth being asked for."""
         row, answer, few = ENGINES[name], self.answers.get(name), self.problem.system.dimension < _FEW
-        if any(turn.ended for turn in self.turns.get(name, ())):
+        if any(turn.ended and turn.effort >= 1 for turn in self.turns.get(name, ())):
             return False
         spared = self.problem.system.dimension < row.spares
         refused = answer is not None and not answer.applicable and answer.reason != SPARED and name in self.ended
@@ -320,22 +320,25 @@ class _Search:
         except OutOfTime:
             self.left_at[name] = self.watch.phase
             self.answers.setdefault(name, stopped(name, self.watch.phase))
-            self._note(name, request, self.watch.spent - begun, ended=False)
+            self._note(name, request, self.watch.spent - begun, None)
             raise
         self.left_at.pop(name, None)
         if answer.applicable or name not in self.answers or not self.answers[name].applicable:
             found(answer)
-        self._note(name, request, self.watch.spent - begun, ended=True)
+        self._note(name, request, self.watch.spent - begun, answer)
 
-    def _note(self, name: str, request: Request, seconds: float, *, ended: bool) -> None:
-        """Keep what a request took, and whether the engine came to its end."""
-        if ended and not (request.quick or request.first):
+    def _note(self, name: str, request: Request, seconds: float, answer: EngineAnswer | None) -> None:
+        """Keep what a request took, and with which effort the engine came to its end (None: it did not)."""
+        if request.quick or request.first:
+            return
+        if answer is not None:
             self.ended.add(name)
-        if request.thorough:
-            known = self.answers[name]
+        spent = None if answer is None else answer.effort
+        if request.thorough or spent is not None:
+            known, effort = self.answers[name], request.effort if spent is None else spent
             lower = -math.inf if known.log10_lower is None else known.log10_lower
-            turn = Turn(effort=request.effort, seconds=seconds, ended=ended, log10_delta=known.log10_delta,
-                        log10_lower=lower)  # fmt: skip
+            turn = Turn(effort=1.0 if effort is None else effort, seconds=seconds, ended=answer is not None,
+                        log10_delta=known.log10_delta, log10_lower=lower)  # fmt: skip
             self.turns.setdefault(name, []).append(turn)
 
     def _asked(self, name: str, request: Request) -> EngineAnswer:

@@ -21,7 +21,7 @@ _GAIN = 1e-6  # of log10: a bound that moved by less did not move
 
 @dataclass(frozen=True, kw_only=True)
 class Turn:
-    """One request of at least effort 1: what it took, and the bounds of the engine after it.
+    """One request: what it took, and the bounds of the engine after it.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Standing:
     log10_delta : float
         Its smallest bound.
     turns : tuple of Turn
-        Requests of at least effort 1, the oldest first.
+        Requests whose effort is known, the oldest first.
     """
 
     name: str
@@ -98,10 +98,13 @@ class Standing:
 
 @dataclass(frozen=True, kw_only=True)
 class Action:
-    """The next request: of which engine, with which effort, for how many seconds at most."""
+    """The next request: of which engine, with which effort, for how many seconds at most.
+
+    Without an effort the engine does as much of what it does alone as it takes to fit into the time.
+    """
 
     engine: str
-    effort: float
+    effort: float | None
     seconds: float
 
 
@@ -117,11 +120,17 @@ def next_action(standings: Sequence[Standing], left: float, *, patient: bool) ->
     patient : bool
         Whether engines are asked for more than effort 1.
     """
-    waiting = [one for one in standings if one.waits and not one.interrupted]
+    waiting = [
+        one for one in standings
+        if one.waits and not one.interrupted and (not one.turns or _most(one, left) >= _GROWTH[0])
+    ]  # fmt: skip
     if waiting:
         chosen = min(waiting, key=lambda one: (one.last, not one.near, one.log10_delta))
         others = len(waiting) > 1 or (patient and any(one.refines and one.applicable for one in standings))
-        return Action(engine=chosen.name, effort=1.0, seconds=_PART * left if others else left)
+        share = _PART * left if others else left
+        known = bool(chosen.turns)
+        effort = min(_last(chosen).effort * _most(chosen, share), 1.0) if known else None
+        return Action(engine=chosen.name, effort=effort, seconds=share)
     if not patient:
         return None
     unfinished = [one for one in standings if not one.exhausted]

@@ -415,10 +415,10 @@ def test_what_is_left_of_a_limit_of_ones_own_goes_to_who_refines(
     asked: list[float] = []
 
     def refine(problem: cb.Problem, request: Request) -> EngineAnswer:
-        if request.effort > 1:
+        if request.at_length:
             asked.append(seconds_left())
-        clock.work(5 if request.effort > 1 else 1, "refining")
-        return EngineAnswer(method="values", log10_delta=-4 if request.effort > 1 else -2)
+        clock.work(5 if request.at_length else 1, "refining")
+        return EngineAnswer(method="values", log10_delta=-4 if request.at_length else -2)
 
     monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine, refines=True))
     verdict = decide(problem(), watch=Watch(30, clock=clock, patient=patient))

@@ -65,7 +65,7 @@ def test_a_limit_on_one_side_is_enough(monkeypatch, near):
     assert len(times) > 10
     assert np.all((lower < truth) & (truth < upper))
     assert np.all((0.9 * truth < lower) & (upper < 1.1 * truth)) or near
-    assert 0.3 < found.mean_lower < 1
+    assert found.mean_lower > 1  # it is infinite; by the curves alone it is less than the horizon
     assert [args[-1] for args in asked] == [[(False, True)]]
     assert found.mean_upper is None  # some never do
 
@@ -136,17 +136,17 @@ def scale_mean(drift, noise, low, start, far):
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(
-    ("drift", "low", "start", "far"),
+    ("drift", "noise", "low", "start"),
     [
-        (lambda x: 0.2 - abs(1 - x) * x, 0.7236, 1.1708, 2.5),  # a box model of the ocean, with a kink at 1
-        (lambda x: 0.3 - x, -0.2, 0.3, 2.5),
-        (lambda x: x - x**3, 0.0, 1.0, 2.5),
+        (lambda x: 0.2 - abs(1 - x) * x, 0.15, 0.7236, 1.1708),  # a box model of the ocean, with a kink at 1
+        (lambda x: 0.3 - x, 0.25, -0.2, 0.3),
+        (lambda x: x - x**3, 0.3, 0.0, 1.0),
     ],
 )
-def test_means_need_a_limit_on_one_side_only_and_no_smooth_model(sign, drift, low, start, far):
+def test_means_need_a_limit_on_one_side_only_and_no_smooth_model(sign, drift, noise, low, start):
     """The mean was [42, none] of the first, whose horizon is short beside it and whose polynomial misses the kink."""
-    mean = scale_mean(drift, 0.15, low, start, far)
-    mirrored = cb.ContinuousSystem(lambda x: [sign * drift(sign * x[0])], states=["x"], diffusion=[[0.15]])
+    mean = scale_mean(drift, noise, low, start, 2.5)
+    mirrored = cb.ContinuousSystem(lambda x: [sign * drift(sign * x[0])], states=["x"], diffusion=[[noise]])
     safe = [cb.Inside(cb.HalfSpace([-sign], -low))]
     found = bound_mean_time(cb.Problem(mirrored, initial=[sign * start], safe=safe, horizon=5))
     assert found[0] <= mean * (1 + 1e-5)

@@ -40,10 +40,11 @@ def played(scripts: dict[str, Script], limit: float) -> tuple[list[Standing], li
     while left > 0 and (action := next_action(standings, left, patient=True)) is not None:
         place = list(scripts).index(action.engine)
         one, script = standings[place], scripts[action.engine]
-        needed, granted = script.seconds(action.effort), min(action.seconds, left)
+        effort = 1.0 if action.effort is None else action.effort
+        needed, granted = script.seconds(effort), min(action.seconds, left)
         ended = needed <= granted
-        level = min(one.log10_delta, script.bound(action.effort)) if ended else one.log10_delta
-        turn = Turn(effort=action.effort, seconds=min(needed, granted), ended=ended, log10_delta=level,
+        level = min(one.log10_delta, script.bound(effort)) if ended else one.log10_delta
+        turn = Turn(effort=effort, seconds=min(needed, granted), ended=ended, log10_delta=level,
                     log10_lower=-math.inf)  # fmt: skip
         standings[place] = replace(one, waits=one.waits and not ended, log10_delta=level, turns=(*one.turns, turn))
         left -= turn.seconds
@@ -72,10 +73,21 @@ def test_the_search_ends_once_all_are_exhausted_or_time_is_over(seed: int) -> No
 
 def test_who_waits_comes_first_the_nearest_before_the_others_and_has_not_all_of_the_time() -> None:
     one, two = (Standing(name=name, waits=True, log10_delta=level) for name, level in (("a", -1.0), ("b", -2.0)))
-    assert next_action([one, two], 10.0, patient=True) == Action(engine="b", effort=1.0, seconds=8.0)
+    assert next_action([one, two], 10.0, patient=True) == Action(engine="b", effort=None, seconds=8.0)
     assert next_action([replace(one, near=True), two], 10.0, patient=False).engine == "a"  # type: ignore[union-attr]
     assert next_action([one, replace(two, last=True)], 10.0, patient=True).engine == "a"  # type: ignore[union-attr]
-    assert next_action([one], 10.0, patient=True) == Action(engine="a", effort=1.0, seconds=10.0)
+    assert next_action([one], 10.0, patient=True) == Action(engine="a", effort=None, seconds=10.0)
+
+
+def test_an_engine_that_did_a_part_of_what_it_does_alone_is_asked_for_the_whole_at_its_pace() -> None:
+    """A grant that was cut to the time of a turn counted as the whole: the next one was many times too large."""
+    part = Turn(effort=0.2, seconds=2.0, ended=True, log10_delta=-1.0, log10_lower=-3.0)
+    one = Standing(name="a", waits=True, refines=True, log10_delta=-1.0, turns=(part,))
+    assert next_action([one], 60.0, patient=True) == Action(engine="a", effort=1.0, seconds=48.0)
+    assert next_action([one], 8.0, patient=True).effort == pytest.approx(0.2 * 0.85 * 0.8 * 8 / 2)  # type: ignore[union-attr]
+    assert next_action([one], 8.0, patient=False).effort == pytest.approx(0.2 * 0.85 * 8 / 2)  # type: ignore[union-attr]
+    assert next_action([one], 3.0, patient=False) is None
+    assert next_action([one], 20.0, patient=False) == Action(engine="a", effort=1.0, seconds=20.0)
 
 
 def test_an_effort_is_what_fits_into_the_time_that_is_left_at_the_pace_so_far() -> None:
@@ -132,8 +144,9 @@ def scripted(monkeypatch: pytest.MonkeyPatch, clock: Time, scripts: dict[str, Sc
         def prove(problem: cb.Problem, request: Request) -> EngineAnswer:
             if script is None:
                 return EngineAnswer(method=name, applicable=False, reason="it does not serve this.")
-            clock.work(script.seconds(request.effort) if request.thorough else 0.5 * script.pace)
-            level = script.bound(request.effort) if request.thorough else 0.5 * script.bound(1.0)
+            effort = 1.0 if request.effort is None else request.effort
+            clock.work(script.seconds(effort) if request.thorough else 0.5 * script.pace)
+            level = script.bound(effort) if request.thorough else 0.5 * script.bound(1.0)
             return EngineAnswer(method=name, log10_delta=level)
 
         refines = script is not None and script.refines

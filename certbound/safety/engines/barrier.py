@@ -102,7 +102,7 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     def tell(barrier: Barrier) -> None:
         asked.found(_answer(problem, barrier))
 
-    degrees = _degrees(work.n, asked.effort)
+    degrees = _degrees(work.n, asked.effort or 1.0)
     for degree in degrees:
         try:
             found = work.search(degree, tell, known=best is not None)
@@ -112,9 +112,9 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             break
         if found is not None and found.log10_probability(problem.horizon) < level:
             best, level = found, found.log10_probability(problem.horizon)
-        if level <= math.log10(problem.delta) or (asked.effort == 1 and 0 > level > _FAR * math.log10(problem.delta)):
+        if level <= math.log10(problem.delta) or (not asked.at_length and 0 > level > _FAR * math.log10(problem.delta)):
             break
-    many = work.n == _MOST_STATES and asked.effort == 1  # that takes a quarter of a minute
+    many = work.n == _MOST_STATES and not asked.at_length  # that takes a quarter of a minute
     if level > math.log10(problem.delta) and not many:
         found = work.steady(degrees[0], tell, level, 1.0 if asked.thorough else _WORTH)
         best = found if found is not None else best

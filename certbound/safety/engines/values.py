@@ -44,19 +44,24 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         return EngineAnswer(applicable=False, method="values", reason=SPARED)
     wide = problem.system.dimension == 3 and not isinstance(problem.system, DiscreteSystem)
     most = _SPACE if wide else _SECONDS
-    most = asked.effort * most if asked.thorough else _SECONDS / 4
-    limit = max(most if asked.effort > 1 else min(most, seconds_left()), _LEAST)
+    limit = asked.effort * most if asked.effort is not None else most if asked.thorough else _SECONDS / 4
+    limit = max(limit if asked.effort is not None else min(limit, seconds_left()), _LEAST)
+    return replace(_answered(problem, asked, limit), effort=limit / most)
+
+
+def _answered(problem: Problem, asked: Request, limit: float) -> EngineAnswer:
+    """The answer to work that stands for so many seconds."""
     try:
         if problem.system.time == "continuous" and problem.endless:
             return _lasting(problem)
         if problem.reach is None and serves(problem):
-            part = limit if asked.effort > 1 else _GRANT * seconds_left()
+            part = limit if asked.effort is not None else _GRANT * seconds_left()
             whole = max(min(limit, part), _LEAST)  # one grid: its steps end, or all is lost
             return _continuous(_confined(problem, limit) or bound_exits_by_steps(problem, seconds=whole))
         if not isinstance(problem.system, DiscreteSystem):
             answer = _continuous(_exits(problem, limit, asked))
             return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer
-        found = _failure(problem, limit, _RATIO if asked.effort == 1 else _RATIO_WITH_EFFORT)
+        found = _failure(problem, limit, _RATIO_WITH_EFFORT if asked.at_length else _RATIO)
     except (InfeasibleError, EnclosureError) as error:
         sure = leaves_surely(problem) if problem.endless else None
         lasting = _surely(problem, sure) if sure is not None else _by_rate(problem) or _without_end(problem, limit)

@@ -32,9 +32,9 @@ from certbound.values.continuous.coefficients import enclose, squared_diffusion
 from certbound.values.exact import interval_of
 from certbound.watch import poll
 
-_FIRST, _MOST = 256, 40_000  # cells at first, and at most
+_FIRST, _MOST = 256, 50_000  # cells at first, and at most
 _GOOD = 3e-4  # of L m, by which it may miss -1 in a cell that is not halved
-_HALVINGS = 24
+_HALVINGS, _IDLE = 24, 3  # rounds at most, and rounds without a better cell than before, after which rounding is in the way
 _WORST = 0.5  # of L m, by which it may miss -1 at all
 _STEEPER = 1 + 1e-6  # times the slope beyond a cut: that at the cut
 _CUTS, _NEAR = 12, 2e-3  # places of a cut, each twice as far as the one before; upper over lower bound, to be done
@@ -140,7 +140,10 @@ class _Model:
     def ranges(self, x: Interval) -> tuple[Interval, Interval]:
         """f and a over boxes, for every disturbance."""
         time, given = self._signals(x)
-        return enclose(self.problem.closed_loop, [time, x, *given])[0][0], enclose(self.square, [time, x])[0][0]
+        return tuple(
+            Interval(np.broadcast_to(one.lo, x.shape), np.broadcast_to(one.hi, x.shape))
+            for one in (enclose(self.problem.closed_loop, [time, x, *given])[0][0], enclose(self.square, [time, x])[0][0])
+        )  # type: ignore[return-value]
 
     def slopes(self, x: Interval) -> tuple[Interval, Interval, Mask]:
         """f' and a' over boxes, and where they are no slopes, as something may jump or bend."""
@@ -157,10 +160,10 @@ class _Model:
         try:
             f, _ = self.ranges(x)
             edge = self.ranges(Interval.point(np.array([start])))[0]
-            back = float(-f.hi[0] if up else f.lo[0])
+            back = float(np.min(-f.hi if up else f.lo))
             slope, _, bent = self.slopes(x)
-            falls = bool(slope.hi[0] <= 0 and not bent[0])  # toward both infinities the drift leads back ever more
-            back = max(back, float(-edge.hi[0] if up else edge.lo[0])) if falls else back
+            falls = bool(np.all(slope.hi <= 0) and not bent.any())  # toward both infinities the drift leads back ever more
+            back = max(back, float(np.min(-edge.hi if up else edge.lo))) if falls else back
         except EnclosureError:
             return None
         if not 0 < back < math.inf:
@@ -195,7 +198,7 @@ class _Mean:
         slope: float = 0.0,
     ) -> _Mean | None:  # fmt: skip
         """m over an interval, on cells that are halved until it is good enough; None where it is not good at all."""
-        nodes, found = np.unique([*np.linspace(*ends, _FIRST + 1), *starts]), None
+        nodes, found, worst = np.unique([*np.linspace(*ends, _FIRST + 1), *starts]), None, list[float]()
         nodes[0], nodes[-1] = ends
         for _ in range(_HALVINGS):
             poll("the mean time of leaving")
@@ -207,7 +210,9 @@ class _Mean:
             off = (found.generated + Interval.point(1.0)).mag
             middles = nodes[:-1] + np.diff(nodes) / 2
             split = (off > _GOOD) & (nodes[:-1] < middles) & (middles < nodes[1:])
-            if not split.any() or len(nodes) + np.count_nonzero(split) > _MOST:
+            worst.append(float(off.max()))
+            idle = len(worst) > _IDLE and worst[-1] >= min(worst[:-_IDLE])
+            if idle or not split.any() or len(nodes) + np.count_nonzero(split) > _MOST:
                 break
             nodes = np.sort(np.concatenate([nodes, middles[split]]))
         return found
