@@ -1,7 +1,7 @@
 """The search for a verdict: which engine is asked when, and what is kept once the time is over.
 
 Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE, those that
-have hardly a chance last. Where nothing is decided then, `certbound.safety.schedule` says who is asked with how much
+have hardly a chance last. Where nothing is decided then, `certbound.safety.search` says who is asked with how much
 effort. Under a limit of time an engine that takes long is interrupted, early for first bounds, later for all others,
 and goes on with what they leave: none starves.
 """
@@ -27,7 +27,7 @@ from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import arrival, best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of, in_order
-from certbound.safety.schedule import Action, Standing, Turn, next_action
+from certbound.safety.search import Action, Standing, Turn, next_action
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, undone, unfinished, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch

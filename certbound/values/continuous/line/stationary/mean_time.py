@@ -10,8 +10,8 @@ stand. Beyond it m goes on as a straight line of slope s with f s <= -1, which s
 paths come back.
 
 m' is a continuous function, a quadratic between nodes, that nearly solves f m' + a m''/2 = -1 (collocation). From there
-on its values at nodes and middles are numbers: L m is enclosed cell by cell, by its middle and its slope, and cells that
-miss -1 by too much are halved. Kinks of the model end in small cells, and cost nothing elsewhere.
+on its values at nodes and middles are numbers: L m is enclosed cell by cell, by its middle and its slope, and cells
+that miss -1 by too much are halved. Kinks of the model end in small cells, and cost nothing elsewhere.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from certbound.watch import poll
 
 _FIRST, _MOST = 256, 50_000  # cells at first, and at most
 _GOOD = 3e-4  # of L m, by which it may miss -1 in a cell that is not halved
-_HALVINGS, _IDLE = 24, 3  # rounds at most, and rounds without a better cell than before, after which rounding is in the way
+_HALVINGS, _IDLE = 24, 3  # rounds at most, and those without a gain, as rounding is in the way
 _WORST = 0.5  # of L m, by which it may miss -1 at all
 _STEEPER = 1 + 1e-6  # times the slope beyond a cut: that at the cut
 _CUTS, _NEAR = 12, 2e-3  # places of a cut, each twice as far as the one before; upper over lower bound, to be done
@@ -140,10 +140,9 @@ class _Model:
     def ranges(self, x: Interval) -> tuple[Interval, Interval]:
         """f and a over boxes, for every disturbance."""
         time, given = self._signals(x)
-        return tuple(
-            Interval(np.broadcast_to(one.lo, x.shape), np.broadcast_to(one.hi, x.shape))
-            for one in (enclose(self.problem.closed_loop, [time, x, *given])[0][0], enclose(self.square, [time, x])[0][0])
-        )  # type: ignore[return-value]
+        f, a = enclose(self.problem.closed_loop, [time, x, *given])[0][0], enclose(self.square, [time, x])[0][0]
+        whole = [Interval(np.broadcast_to(one.lo, x.shape), np.broadcast_to(one.hi, x.shape)) for one in (f, a)]
+        return whole[0], whole[1]
 
     def slopes(self, x: Interval) -> tuple[Interval, Interval, Mask]:
         """f' and a' over boxes, and where they are no slopes, as something may jump or bend."""
@@ -162,7 +161,7 @@ class _Model:
             edge = self.ranges(Interval.point(np.array([start])))[0]
             back = float(np.min(-f.hi if up else f.lo))
             slope, _, bent = self.slopes(x)
-            falls = bool(np.all(slope.hi <= 0) and not bent.any())  # toward both infinities the drift leads back ever more
+            falls = bool(np.all(slope.hi <= 0) and not bent.any())  # the drift leads back ever more
             back = max(back, float(np.min(-edge.hi if up else edge.lo))) if falls else back
         except EnclosureError:
             return None

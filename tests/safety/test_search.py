@@ -13,7 +13,7 @@ import certbound as cb
 from certbound.safety.answers import EngineAnswer, Request
 from certbound.safety.decision import decide
 from certbound.safety.portfolio import ENGINES
-from certbound.safety.schedule import Action, Standing, Turn, next_action
+from certbound.safety.search import Action, Standing, Turn, next_action
 from certbound.watch import Watch, poll
 
 
@@ -64,7 +64,7 @@ def test_the_search_ends_once_all_are_exhausted_or_time_is_over(seed: int) -> No
         for k in range(rng.integers(1, 6))
     }  # fmt: skip
     limit = float(10 ** rng.uniform(0, 3))
-    standings, asked, left = played(scripts, limit)
+    standings, _, left = played(scripts, limit)
     assert left < 1e-9 or all(one.exhausted for one in standings)
     for one, script in zip(standings, scripts.values()):
         if left > 1e-9:  # nothing that an engine can prove is left

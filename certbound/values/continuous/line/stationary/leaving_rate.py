@@ -1,12 +1,13 @@
 """The rate of leaving an interval, from both sides, by functions of the state alone.
 
 Let L v = f v' + a v''/2 with a = g^2 >= 0. Where v <= 0 at the ends and L v >= -k v for every disturbance, e^{kt} v(X)
-is a submartingale until the exit, so that P(not left before T) >= e^{-kT} v(x)/sup v for every T at once. Where p > 0 on
-all of [low, high] and L p <= -k p, P(not left before T) <= e^{-kT} p(x)/min p. v is the first eigenfunction of L less a
-little of m with L m = -1 (so that L v > 0 at the ends, where v vanishes), p that of a slightly longer interval.
+is a submartingale until the exit, so that P(not left before T) >= e^{-kT} v(x)/sup v for every T at once. Where p > 0
+on all of [low, high] and L p <= -k p, P(not left before T) <= e^{-kT} p(x)/min p. v is the first eigenfunction of L
+less a little of m with L m = -1 (so that L v > 0 at the ends, where v vanishes), p that of a slightly longer interval.
 
-Both are polynomials by collocation, their coefficients are numbers from there on, and L v is enclosed over small cells:
-v' and v'' at their middles with what is rounded, elsewhere by a bound of the next derivative (|T_k^(j)| is largest at 1).
+Both are polynomials by collocation, their coefficients are numbers from there on, and L v is enclosed over small
+cells: v' and v'' at their middles with what is rounded, elsewhere by a bound of the next derivative (|T_k^(j)| is
+largest at 1).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from certbound.rigor import rounding
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import enclose
-from certbound.values.continuous.line.mean_time import limits_of, squared_of
+from certbound.values.continuous.line.stationary.mean_time import limits_of, squared_of
 
 _DEGREE = 28
 _CELLS = 2**14
