@@ -27,6 +27,7 @@ from certbound.safety.certificates import (
     values_proof_below,
 )
 from certbound.safety.engines import (
+    backward_engine,
     barrier_engine,
     by_logarithms,
     constants_engine,
@@ -178,6 +179,17 @@ ENGINES: dict[str, Engine] = {
             dear=True,
             reaches=True,
             endless=True,
+        ),
+        Engine(
+            name="backward",
+            words="the backward equation solved in floats, its error bounded cell by cell and carried by the process "
+            "(Thm K10, two and three states in continuous time)",
+            when="while nothing else has proved SAFE; limits along the coordinates, noise along some states or all; "
+            "bounds from both sides",
+            prove=in_coordinates(backward_engine),
+            reserve=True,
+            refines=True,
+            dear=True,
         ),
     )
 }

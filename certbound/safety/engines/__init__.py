@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from certbound.safety.engines.backward import backward_engine
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
@@ -15,6 +16,7 @@ from certbound.safety.engines.values import values_engine
 
 __all__ = [
     "Apart",
+    "backward_engine",
     "Barrier",
     "barrier_engine",
     "by_logarithms",

@@ -8,6 +8,7 @@ below -1 at limits and 0 at other ends of the box), and v(T) >= 0.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from certbound.values.backward.splines import DEGREE, Axis, Sampling, apply_dens
 
 END = 0.004  # of the horizon: the layer at its end
 _FIRST, _GROWTH = 12, 1.3  # steps within that layer, and how they grow
-_MARGIN = 0.1  # by which a source exceeds what it pays for
+_MARGIN, _MORE = 0.1, 1.0  # by which the first source exceeds what it pays for, and how this grows from pass to pass
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
 _SOFT = 3.0
 _KILL = 10.0
@@ -156,8 +157,14 @@ class Side:
             face_of(self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])))
             for i in range(n) for side in (0, 1)
         ]
+        self.margin = _MARGIN
         self.values: list[Array] = []
         self.rates: list[Array] = []
+
+    @property
+    def work(self) -> int:
+        """Cells of space and time."""
+        return int(np.prod([axis.cells for axis in self.axes])) * len(self.steps)
 
     def _goal(self, limit: bool) -> float:
         return 1.0 if self.above else -1.0 if limit else 0.0
@@ -196,15 +203,16 @@ class Side:
 
     def residuals(self) -> list[Array]:
         """A bound of v_t + L v on every cell, slab by slab from the end backward."""
-        cells = int(np.prod([axis.cells for axis in self.axes]))
-        many = max(1, _BATCH // cells)
-        result: list[Array] = []
-        for begin in range(0, len(self.steps), many):
-            end = min(begin + many, len(self.steps))
-            knots = [np.array(rows[begin : end + 1]) for rows in (self.values, self.rates)]
-            bound = residual_bound(self.generator, knots[0], knots[1], self.steps[begin:end])
-            result += list(np.where(self._decided(*knots, self.steps[begin:end]), 0.0, np.maximum(bound, 0.0)))
-        return result
+        many = max(1, _BATCH * len(self.steps) // self.work)
+        with ThreadPoolExecutor(2) as pool:
+            parts = pool.map(lambda begin: self._bounded(begin, begin + many), range(0, len(self.steps), many))
+            return [bound for part in parts for bound in part]
+
+    def _bounded(self, begin: int, end: int) -> list[Array]:
+        steps = self.steps[begin:end]
+        values, rates = (np.array(rows[begin : begin + len(steps) + 1]) for rows in (self.values, self.rates))
+        bound = residual_bound(self.generator, values, rates, steps)
+        return list(np.where(self._decided(values, rates, steps), 0.0, np.maximum(bound, 0.0)))
 
     def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:
         """Cells and slabs on which v is so large that nothing is asked of it any more."""
@@ -220,14 +228,15 @@ class Side:
         equation = self.carrier.equation
         slabs = [self._spread(r) + b for r, b in zip(residuals, self._at_exits())]
         ends = [slabs[0], *(np.maximum(p, q) for p, q in zip(slabs, slabs[1:])), slabs[-1]]
-        ends = [(1 + _MARGIN) * s * equation.live for s in ends]
-        missing = (1 + _MARGIN) * self._spread(self.shortfall_at_end()) * equation.live
+        ends = [(1 + self.margin) * s * equation.live for s in ends]
+        missing = (1 + self.margin) * self._spread(self.shortfall_at_end()) * equation.live
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
         self._add(0, e, equation.speed(e, ends[0]))
         for k, step in enumerate(self.steps):
             begin, end = ends[k], ends[k + 1]
             e = equation.step(e, step, lambda part, p=begin, q=end: (1 - part) * p + part * q, lambda part: 0.0)
             self._add(k + 1, e, equation.speed(e, end))
+        self.margin *= _MORE
 
     def _at_exits(self) -> list[Array]:
         """Sources beyond the faces, from which e takes what v lacks there, slab by slab."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -19,13 +18,16 @@ from certbound.values.backward.setting import Setting, setting_of
 from certbound.values.backward.splines import Derivatives, unit
 from certbound.watch import poll
 
-_COARSEST = {2: 0.06, 3: 0.1}  # cell of the first run, as a share of the range: a second a side
+_COARSEST = {2: 0.06, 3: 0.07}  # cell of the first grid, as a share of the range
 _STEPS = 1.8  # cells of the range a step: errors in space and in time are about alike then
 _PASSES = 8
-_CLOSE = 1.02  # ratio of the bounds that ends the search
+_CLOSE = 1.01  # ratio of the bounds that ends the search
 _PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
-_GROWTH = 6.0  # the largest factor of work from one run to the next
+_GROWTH = 6.0  # the largest factor of work from one grid to the next
+_LEAST = 1.5  # the smallest one that is worth it
 _STARTS = 9  # points along each side of a start set
+RATE = {2: 1.5e5, 3: 1.0e5}
+"""Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -42,7 +44,8 @@ class Bounds:
         Grids that were tried.
     estimate : float
         The probability by the numerical solution; nothing is proved of it.
-    seconds : float
+    work : float
+        Cells of space and time that passes went over.
     """
 
     lower: float
@@ -51,7 +54,7 @@ class Bounds:
     steps: int
     runs: int
     estimate: float
-    seconds: float
+    work: float
 
 
 def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0) -> Iterator[Bounds]:
@@ -62,7 +65,8 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     problem : Problem
         Continuous time, two or three states, limits along the coordinates; any noise.
     seconds : float
-        How long to refine; the first grid is finished in any case.
+        How long to refine, in units of work (`RATE`): the bounds do not depend on the machine or its load. The first
+        grid is finished in any case.
     delta : float
         Where the numerical solution says on which side of ``delta`` the answer lies, only the bound that shows it is
         looked for; 0 for both.
@@ -82,39 +86,33 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     setting = setting_of(problem)
     if setting.dimension not in _COARSEST:
         raise InfeasibleError("values with a carried error serve two and three states here.")
-    begin, starts = time.perf_counter(), _starts(problem)
-    cell, best, runs = _COARSEST[setting.dimension], (0.0, 1.0), 0
+    starts, cell = _starts(problem), _COARSEST[setting.dimension]
+    budget = seconds * RATE[setting.dimension]
+    lower, upper, work, runs = 0.0, 1.0, 0.0, 0
+    sides = (True, False)
     while True:
-        started = time.perf_counter()
-        count, cells, estimate = math.ceil(_STEPS / cell), (), 0.0
-        wanted = [True, False]
-        while wanted:
-            above = wanted.pop(0)
+        before, count = work, math.ceil(_STEPS / cell)
+        for above in sides:
             side = Side(setting, np.full(setting.dimension, cell), count, above)
             side.propose()
             estimate = abs(largest_at_start(side, starts)[0])
-            if above and delta > 0:
-                above_is_enough, below_is_enough = estimate < delta, estimate > delta
-                if below_is_enough and best[1] <= 1 and runs > 0:
-                    continue
-                if above_is_enough and runs > 0:
-                    wanted = []
-            bound = refined(side, starts)
-            best = (best[0], min(best[1], bound)) if above else (max(best[0], -bound), best[1])
-            cells = tuple(axis.cells for axis in side.axes)
+            bound, passes = refined(side, starts)
+            work += passes * side.work
+            lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
         runs += 1
-        spent = time.perf_counter() - started
-        left = seconds - (time.perf_counter() - begin)
-        yield Bounds(lower=max(best[0], 0.0), upper=min(best[1], 1.0), cells=cells, steps=count, runs=runs,
-                     estimate=estimate, seconds=time.perf_counter() - begin)  # fmt: skip
-        if best[1] <= _CLOSE * best[0] or left <= 1.2 * spent:
+        cells = tuple(axis.cells for axis in side.axes)
+        yield Bounds(lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work)
+        growth = min(_GROWTH, (budget - work) / (work - before))
+        if upper <= _CLOSE * lower or upper <= delta or lower > delta > 0 or growth < _LEAST:
             return
-        work = min(_GROWTH, 0.7 * left / spent)
-        cell /= max(work, 1.3) ** (1 / (setting.dimension + 1))
+        if delta > 0:
+            growth *= len(sides)
+            sides = (estimate < delta,)
+        cell /= growth ** (1 / (setting.dimension + 1))
 
 
-def refined(side: Side, starts: Starts) -> float:
-    """The bound of one side: passes of the carried error until what is left of the residual is paid at once."""
+def refined(side: Side, starts: Starts) -> tuple[float, int]:
+    """The bound of one side: passes of the carried error until what is left of the residual is paid at once, and their number."""
     best = math.inf
     for k in range(_PASSES):
         poll("solving for the error that is left")
@@ -128,7 +126,7 @@ def refined(side: Side, starts: Starts) -> float:
         if left + missing <= _PAID * abs(value) or value >= end or k == _PASSES - 1:
             break
         side.correct(residuals)
-    return best
+    return best, k + 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -1,0 +1,95 @@
+"""Certified bounds of failing by the backward equation: they hold, and a wrong proposal costs width, never truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.values.backward import bound_failing
+from certbound.values.backward.carry import Side
+from certbound.values.backward.door import _starts, refined
+from certbound.values.backward.setting import setting_of
+
+
+def last(problem: cb.Problem, seconds: float = 1.0, delta: float = 0.0):
+    return list(bound_failing(problem, seconds=seconds, delta=delta))[-1]
+
+
+def two_independent(sigma: float = 0.5) -> tuple[cb.Problem, float]:
+    """Two copies of one state, and what fails by the product of their survivals (proved to three digits in one state)."""
+    system = cb.ContinuousSystem(lambda x, y: [-x, -y], states=["x", "y"], diffusion=sigma * np.eye(2))
+    one = cb.ContinuousSystem(lambda x: [-x[0]], states=1, diffusion=[[sigma]])
+    alone = cb.Problem(one, initial=[0.2], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2.0)
+    verdict = cb.verify_safety(alone, method="values")
+    truth = 1 - (1 - 10**verdict.log10_delta) ** 2
+    both = cb.Problem(system, initial=[0.2, 0.2], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2.0)
+    return both, truth
+
+
+def oscillator() -> cb.Problem:
+    system = cb.ContinuousSystem(lambda x, v: [v, -x - 0.5 * v], states=["x", "v"], diffusion=[[0.0], [0.5]])
+    return cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -np.inf], [1, np.inf]))], horizon=4.0)
+
+
+def test_two_independent_states_fail_as_often_as_the_bounds_say() -> None:
+    problem, truth = two_independent()
+    found = last(problem, seconds=4.0)
+    assert found.lower <= truth * (1 + 1e-3)
+    assert found.upper >= truth * (1 - 1e-3)
+    assert found.upper < 2 * truth
+    assert found.lower > 0.4 * truth
+
+
+def test_noise_in_the_velocity_alone_is_bounded_from_both_sides() -> None:
+    problem = oscillator()
+    found = last(problem, seconds=6.0)
+    seen = cb.simulate_exits(problem, paths=20000, rng=np.random.default_rng(0), confidence=1 - 1e-6)
+    assert found.lower <= seen.upper
+    assert found.upper >= seen.lower
+    assert 0 < found.lower < found.upper < 1
+
+
+@pytest.mark.parametrize("above", [True, False])
+@pytest.mark.parametrize("wrong", ["noise", "half", "nothing"])
+def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -> None:
+    problem, truth = two_independent()
+    setting, rng = setting_of(problem), np.random.default_rng(7)
+    side = Side(setting, np.full(2, 0.1), 12, above)
+    side.propose()
+    for rows in (side.values, side.rates):
+        for k, row in enumerate(rows):
+            rows[k] = row + 0.02 * rng.normal(size=row.shape) if wrong == "noise" else 0.5 * row if wrong == "half" else 0 * row
+    bound, _ = refined(side, _starts(problem))
+    if above:
+        assert bound >= truth * (1 - 1e-3)
+    else:
+        assert -bound <= truth * (1 + 1e-3)
+
+
+def test_all_starts_of_a_box_are_covered_from_above_and_the_worst_counts_from_below() -> None:
+    problem, _ = two_independent()
+    center, corner = last(problem.replace(initial=[0.0, 0.0])), last(problem.replace(initial=[0.4, 0.4]))
+    box = last(problem.replace(initial=cb.Box([0, 0], [0.4, 0.4])))
+    assert box.upper >= corner.lower
+    assert box.upper >= center.upper
+    assert box.lower >= center.lower
+
+
+def test_the_engine_answers_in_a_verdict_and_says_how() -> None:
+    problem, truth = two_independent()
+    verdict = cb.verify_safety(problem.replace(delta=min(3 * truth, 0.9)), method="backward")
+    assert verdict.status == "SAFE"
+    assert "whose error is carried" in verdict.reason
+    verdict = cb.verify_safety(problem.replace(delta=truth / 3), method="backward")
+    assert verdict.status == "UNSAFE"
+
+
+def test_three_states_are_bounded_from_above() -> None:
+    system = cb.ContinuousSystem(lambda x, y, z: [-x, -y, -z], states=["x", "y", "z"], diffusion=0.5 * np.eye(3))
+    box = cb.Box([-1] * 3, [1] * 3)
+    problem = cb.Problem(system, initial=[0.2] * 3, safe=[cb.Inside(box)], horizon=0.5)
+    setting = setting_of(problem)
+    side = Side(setting, np.full(3, 0.1), 10, True)
+    side.propose()
+    assert refined(side, _starts(problem))[0] >= 0.005

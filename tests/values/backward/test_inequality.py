@@ -1,0 +1,175 @@
+"""The trusted inequality: bounds of splines, coefficients and residuals hold at random points, whatever is proposed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import EnclosureError
+from certbound.rigor.intervals import Interval
+from certbound.values.backward.coefficients import Fields
+from certbound.values.backward.residual import Generator, residual_bound
+from certbound.values.backward.setting import setting_of
+from certbound.values.backward.splines import Axis, Derivatives, Sampling, most_on_cells
+
+PARTS = (2, 3, 4)
+
+
+def axis(rng: np.random.Generator, cells: int, parts: int, low: float = -1.0, high: float = 1.5) -> Axis:
+    inner = np.sort(rng.uniform(low, high, cells - 1))
+    return Axis(np.concatenate([[low], inner, [high]]), Sampling(parts))
+
+
+def value(axes: tuple[Axis, ...], coefficients: np.ndarray, points: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
+    """A tensor spline's derivative at points, shape (P, n), one row after the other."""
+    rows = [one.at_points(points[:, k], order).along(np.eye(one.cells + 5), 0) for k, (one, order)
+            in enumerate(zip(axes, orders))]  # fmt: skip
+    return np.einsum("pi,pj,ij->p", *rows, coefficients)
+
+
+def cell_of(axes: tuple[Axis, ...], points: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple(
+        np.clip(np.searchsorted(one.nodes, points[:, k], side="right") - 1, 0, one.cells - 1)
+        for k, one in enumerate(axes)
+    )
+
+
+def points_in(axes: tuple[Axis, ...], rng: np.random.Generator, count: int = 4000) -> np.ndarray:
+    return np.stack([rng.uniform(one.nodes[0], one.nodes[-1], count) for one in axes], axis=1)
+
+
+@pytest.mark.parametrize("orders", [(0, 0), (1, 0), (0, 2), (2, 1), (3, 2), (5, 0), (4, 4)])
+def test_derivatives_of_a_spline_lie_within_their_bounds_on_every_cell(orders: tuple[int, int]) -> None:
+    rng = np.random.default_rng(1)
+    axes = (axis(rng, 9, 2), axis(rng, 11, 4))
+    c = rng.normal(size=(14, 16))
+    size = Derivatives(axes, c[None]).size(orders)[0]
+    points = points_in(axes, rng)
+    seen = np.abs(value(axes, c, points, orders))
+    bound = size[cell_of(axes, points)]
+    assert np.all(seen <= bound * (1 + 1e-9))
+    assert np.max(seen / bound) > 0.3
+
+
+def test_bernstein_coefficients_bound_a_spline_closely_from_above() -> None:
+    rng = np.random.default_rng(2)
+    axes = (axis(rng, 9, 2), axis(rng, 11, 2))
+    c = rng.normal(size=(14, 16))
+    points = points_in(axes, rng, 20000)
+    most, cells = most_on_cells(axes, c[None])[0], cell_of(axes, points)
+    seen = np.full(most.shape, -np.inf)
+    np.maximum.at(seen, cells, value(axes, c, points, (0, 0)))
+    assert np.all(seen <= most + 1e-12)
+    assert np.median((most - seen)[np.isfinite(seen)]) < 0.2
+
+
+def test_nodal_values_of_a_quintic_give_it_back_also_from_nodes_beyond_the_axis() -> None:
+    rng = np.random.default_rng(3)
+    one = axis(rng, 12, 2)
+    longer = np.concatenate([one.nodes, one.nodes[-1] + 0.1 * np.arange(1, 6)])
+    quintic = np.polynomial.Polynomial([0.3, -1, 0.5, 2, -0.7, 0.2])
+    for nodes in (one.nodes, longer):
+        c = one.from_nodes(nodes) @ quintic(nodes)
+        assert np.allclose(one.at_points(one.lattice, 1).along(c, 0), quintic.deriv()(one.lattice), atol=1e-7)
+
+
+MODELS = {
+    "smooth": lambda x, y: [np.sin(2 * x) * y - x, np.exp(-x) + x * y / (2 + y**2)],
+    "kinks": lambda x, y: [np.abs(x - 0.1) - y, np.maximum(x, y) - np.minimum(y, 0.3)],
+    "a jump": lambda x, y: [np.where(x < 0.2, 1.0, -1.0) - x, x - y],
+}
+
+
+def fields_of(name: str) -> Fields:
+    system = cb.ContinuousSystem(MODELS[name], states=["x", "y"], diffusion=[[0.5, 0.0], [0.2, 0.4]])
+    return Fields(system.dynamics, 2)
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("name", MODELS)
+def test_interpolated_coefficients_are_off_by_at_most_their_errors(name: str, parts: int) -> None:
+    rng = np.random.default_rng(4)
+    axes = (axis(rng, 8, parts), axis(rng, 7, parts))
+    points = points_in(axes, rng)
+    cells = cell_of(axes, points)
+    for k, field in enumerate(fields_of(name).on(axes, Interval.point(0.0))):
+        assert field is not None
+        shares = [(points[:, i] - one.nodes[cells[i]]) / np.diff(one.nodes)[cells[i]] for i, one in enumerate(axes)]
+        rows = [_lagrange(one.sampling.nodes, share) for one, share in zip(axes, shares)]
+        places = [cells[i][:, None] * parts + np.arange(parts + 1) for i in range(2)]
+        samples = field.lattice[places[0][:, :, None], places[1][:, None, :]]
+        p = np.einsum("pi,pj,pij->p", *rows, samples)
+        truth = np.asarray(MODELS[name](points[:, 0], points[:, 1])[k])
+        assert np.all(np.abs(p - truth) <= field.error[cells] * (1 + 1e-9) + 1e-13)
+        assert np.all(np.abs(p) <= field.slopes[0][0][cells] * (1 + 1e-9))
+
+
+def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
+    rows = np.ones((len(places), len(nodes)))
+    for i, node in enumerate(nodes):
+        for other in np.delete(nodes, i):
+            rows[:, i] *= (places - other) / (node - other)
+    return rows
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("name", MODELS)
+def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(name: str, parts: int) -> None:
+    rng = np.random.default_rng(5)
+    axes = (axis(rng, 7, parts), axis(rng, 8, parts))
+    g = np.array([[0.5, 0.0], [0.2, 0.4]])
+    a = g @ g.T
+    drift = fields_of(name).on(axes, Interval.point(0.0))
+    generator = Generator.of(axes, drift, _constant_fields(axes, a))
+    values, rates = rng.normal(size=(3, 12, 13)), rng.normal(size=(3, 12, 13))
+    steps = np.array([0.3, 0.2])
+    bound = residual_bound(generator, values, rates, steps)
+    points, t = points_in(axes, rng), rng.uniform(0, 1, 4000)
+    cells = cell_of(axes, points)
+    f = [np.broadcast_to(row, t.shape) for row in MODELS[name](points[:, 0], points[:, 1])]
+    for slab, h in enumerate(steps):
+        late, early = slab, slab + 1  # knots are listed from the last one backward
+        basis = np.array([2 * t**3 - 3 * t**2 + 1, (t**3 - 2 * t**2 + t) * h, 3 * t**2 - 2 * t**3, (t**3 - t**2) * h])
+        slope = np.array([6 * t**2 - 6 * t, (3 * t**2 - 4 * t + 1) * h, 6 * t - 6 * t**2, (3 * t**2 - 2 * t) * h]) / h
+        data = (values[early], rates[early], values[late], rates[late])
+
+        def at(orders: tuple[int, int], weights: np.ndarray, data: tuple[np.ndarray, ...] = data) -> np.ndarray:
+            return sum(w * value(axes, one, points, orders) for w, one in zip(weights, data))
+
+        r = at((0, 0), slope) + f[0] * at((1, 0), basis) + f[1] * at((0, 1), basis)
+        r += a[0, 0] / 2 * at((2, 0), basis) + a[1, 1] / 2 * at((0, 2), basis) + a[0, 1] * at((1, 1), basis)
+        assert np.all(r <= bound[slab][cells] + 1e-9)
+
+
+def _constant_fields(axes: tuple[Axis, ...], a: np.ndarray) -> list:
+    from certbound.problem.model import trace
+
+    tape = trace(lambda t, x: [float(entry) for entry in a.ravel()], {"t": ["t"], "x": ["x", "y"]})
+    return Fields(tape, 2).on(axes, Interval.point(0.0))
+
+
+def test_a_model_that_is_undefined_on_a_cell_is_refused() -> None:
+    rng = np.random.default_rng(6)
+    system = cb.ContinuousSystem(lambda x, y: [np.log(x) - y, -y], states=["x", "y"], diffusion=np.eye(2))
+    axes = (axis(rng, 7, 2), axis(rng, 7, 2))
+    with pytest.raises(EnclosureError, match="undefined"):
+        Fields(system.dynamics, 2).on(axes, Interval.point(0.0))
+
+
+def test_settings_that_are_not_served_are_refused_by_name() -> None:
+    from certbound.errors import InfeasibleError
+
+    plain = {"states": ["x", "y"], "diffusion": np.eye(2)}
+    stay = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    cases = {
+        "discrete": cb.DiscreteSystem(lambda x, y: [x / 2, y / 2], states=["x", "y"], noise=cb.Gaussian(std=0.1)),
+        "changes with time": cb.ContinuousSystem(lambda t, x, y: [np.sin(t) - x, -y], **plain),
+        "disturbance": cb.ContinuousSystem(
+            lambda x, d: [d[0] - x[0], -x[1]], disturbance=cb.Box([-0.1], [0.1]), **plain
+        ),
+    }
+    for words, system in cases.items():
+        problem = cb.Problem(system, initial=[0, 0], safe=stay, horizon=1 if words != "discrete" else 5)
+        with pytest.raises(InfeasibleError, match=words):
+            setting_of(problem)
