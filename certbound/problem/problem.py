@@ -89,6 +89,9 @@ class Problem(Shown):
         For humans.
     parameters : mapping, optional
         Parameters that the problem was built with, for the record.
+    changes : sequence of Change, optional
+        When the rows of an array plan change, where that is not just at the ends of equal pieces (CT): one entry for
+        0, for every end between two pieces, and for the horizon. For problems that are made of others.
     source : mapping, optional
         The content of the problem file it came from, for saving it as written; dropped by ``replace``.
 
@@ -124,6 +127,7 @@ class Problem(Shown):
     units: Any = field(default=None, kw_only=True)
     name: str = field(default="problem", kw_only=True)
     parameters: Any = field(default=None, kw_only=True)
+    changes: Any = field(default=None, kw_only=True, repr=False)
     source: Any = field(default=None, kw_only=True, repr=False)
     _closed_loop: Tape | None = field(default=None, init=False, repr=False)
 
@@ -304,6 +308,8 @@ class Problem(Shown):
                 "`horizon` must not change alone when the plan is an array over it; give `plan=` as well."
             )
         values = {name: getattr(self, name) for name in known}
+        if "horizon" in changes and "changes" not in changes:
+            values["changes"] = None
         if "system" in changes and "cost" not in changes and changes["system"].inputs is None:
             values["cost"] = None
         return Problem(**(values | changes))

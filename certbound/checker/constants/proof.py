@@ -217,7 +217,8 @@ class _Proof:
             (arb.neg_inf() if low is None else arb(low), arb.pos_inf() if high is None else arb(high))
             for low, high in ends
         ]
-        columns = [] if model.plan is None else list(zip(*model.plan))
+        rows = [*(model.plan or []), *(row for change in model.changes or [] for row in (change.low, change.high))]
+        columns = list(zip(*rows))
         inputs = [(arb(min(column)), arb(max(column))) for column in columns]
         disturbances = [(arb(a), arb(b)) for a, b in model.disturbance]
         return [(arb(0), arb(model.horizon)), *states, *inputs, *disturbances]

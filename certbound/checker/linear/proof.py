@@ -11,7 +11,8 @@ constraints hold wherever Z stays below what y and R leave, and the probabilitie
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -314,6 +315,7 @@ class _Cell:
         if self.state is not None and not self.state.holds(k, low, high):
             raise Unproved(f"the state was not shown to stay in the set over which its noise is bounded on piece {k}")
         sides = {unit: (low[d], high[d]) for d, unit in enumerate(self.shared.units)}
+        jumped = self._jumped(k, outputs, sides)
         for i, output in enumerate(outputs):
             output.prepare(data)
             hidden = hidden_of[i]
@@ -323,11 +325,28 @@ class _Cell:
                 raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
             frame = self.frames[i] if number_ is None else self.shared.coordinates(output.states)
             polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame, sides=sides)
-            least, most = (self.low[k][i] * scale).upper(), (self.high[k][i] * scale).lower()
+            least = (self.low[k][i] * scale + jumped[i]).upper()
+            most = (self.high[k][i] * scale - jumped[i]).lower()
             if not output.prove(polytope, least, most, self.budget):
                 name = self.model.states[i]
                 at = f"piece {k}" if self.model.continuous else f"step {k}"
                 raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
+
+    def _jumped(self, k: int, outputs: Sequence[OutputRemainder], sides: Mapping[int, tuple[arb, arb]]) -> list[arb]:
+        """How much of B a row of the plan takes that holds on a part of piece k, beside its own pieces.
+
+        There beta misses what the piece's own row gives by at most D. All bounds of R rest on integrals of |beta - m|
+        over a piece, m the middle of B: with beta elsewhere as much inside of B as that part times D, they hold.
+        """
+        found = self.shared.beside(k)
+        if found is None:
+            return [arb(0)] * len(outputs)
+        inputs, part = found
+        data, widths = self._data(k), []
+        values = [*data.values[: len(data.values) - len(inputs)], *inputs]
+        for output in outputs:
+            widths.append((output.width(replace(data, values=values), sides) * part).upper())
+        return widths
 
     def _data(self, k: int) -> PieceData:
         """The parameters of the remainder's expressions."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import NamedTuple
 
 from flint import arb, arb_mat
 
@@ -79,6 +81,15 @@ class Initial:
     around: bool = False
 
 
+class Change(NamedTuple):
+    """Rows of a plan change from ``first`` to ``last``, exact times; meanwhile inputs lie in ``low`` to ``high``."""
+
+    first: Fraction
+    last: Fraction
+    low: list[float]
+    high: list[float]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
     """A problem as the checker knows it; ``constraints`` ends with the domain where there is one."""
@@ -103,6 +114,7 @@ class Model:
     drawn: tuple[Drawn, ...] = ()  # constants, over whose values the probability is an average
     hold: Hold | None = None  # then the inputs of the dynamics are what its law said last
     by_ito: bool = False  # derived by Ito's formula: no disturbance sees coming noise then
+    changes: list[Change] | None = None  # of rows that do not change just at the ends of equal pieces; at 0, ..., T
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     )
     from certbound.problem.model.recombined import in_logarithms, turned_tape
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
-    from certbound.problem.model.time_jumps import between_jumps, cut_at_jumps
+    from certbound.problem.model.time_jumps import Change, between_jumps, cut_at_jumps
     from certbound.problem.model.tracing import trace
 
 _HOME = {
@@ -51,7 +51,7 @@ _HOME = {
     "recombined": "in_logarithms turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
-    "time_jumps": "between_jumps cut_at_jumps",
+    "time_jumps": "between_jumps Change cut_at_jumps",
     "tracing": "trace",
 }
 
@@ -61,6 +61,7 @@ __all__ = [
     "between_jumps",
     "ARITY",
     "call_network",
+    "Change",
     "compile_numpy",
     "compile_scalar",
     "cut_at_jumps",

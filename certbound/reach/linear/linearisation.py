@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from fractions import Fraction
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -350,8 +352,29 @@ class Linearisation:
             velocity=velocity, middle_acceleration=middle_acceleration, acceleration=acceleration, jerk=jerk,
             slope=middle_slope, drift=flat(drift), input_gain=flat(gain),
             inputs=np.tile(self.inputs, (cells, 1)), disturbance_middle=self.d_middle,
-            disturbance_low=self.d_low, disturbance_high=self.d_high,
+            disturbance_low=self.d_low, disturbance_high=self.d_high, **self._beside,
         )
+
+    @property
+    def _beside(self) -> dict[str, Any]:
+        """What a frame holds of rows that do not change just at the ends of their pieces."""
+        changes, count = self.problem.changes, self.pieces
+        if changes is None:
+            return {}
+        horizon, rows = Fraction(self.problem.horizon), len(changes) - 1
+        ends = [horizon * edge / rows for edge in range(rows + 1)]
+        missed = [max(one.last, end) - min(one.first, end) for one, end in zip(changes, ends)]
+        if not any(missed):
+            return {}
+        low, high, own = self.inputs.copy(), self.inputs.copy(), len(changes[0].low)
+        for edge, (change, miss) in enumerate(zip(changes, missed)):
+            place = edge * (count // rows)
+            for piece in (place - 1, place):
+                if miss and 0 <= piece < count:
+                    low[piece, :own] = np.minimum(low[piece, :own], change.low)
+                    high[piece, :own] = np.maximum(high[piece, :own], change.high)
+        beside = Interval(np.tile(low, (self.cells, 1)), np.tile(high, (self.cells, 1)))
+        return {"beside": beside, "part": float(2 * max(missed) * count / horizon) * (1 + 1e-12)}
 
     @cached_property
     def sizes(self) -> Array:
