@@ -28,7 +28,7 @@ from certbound.problem.ingredients import (
     described,
     samples_of,
 )
-from certbound.problem.model import Tape, substitute, trace
+from certbound.problem.model import Tape, rounded_comparison, substitute, trace
 from certbound.problem.sets import (
     Box,
     GaussianStart,
@@ -42,6 +42,7 @@ from certbound.problem.sets import (
 )
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
+MOST_STEPS = 2**20  # after which comparisons are not looked at
 DOMAIN = "the model's domain"
 """Label of the constraint to stay in it."""
 
@@ -156,6 +157,7 @@ class Problem(Shown):
             check_target(self.reach.region, self.kept, self.system.dimension)
         if self.hold is None and (self.plan is not None or self.system.inputs is None):
             assign(self, _closed_loop=self._closed())
+        self._refuse_rounding()
 
     @property
     def constraints(self) -> tuple[Inside, ...]:
@@ -313,6 +315,23 @@ class Problem(Shown):
         if "system" in changes and "cost" not in changes and changes["system"].inputs is None:
             values["cost"] = None
         return Problem(**(values | changes))
+
+    def _refuse_rounding(self) -> None:
+        """Refuse comparisons of which a program that rounds takes another side than exact arithmetic does."""
+        steps = int(min(self.horizon, MOST_STEPS)) if self.system.time == "discrete" else 0
+        noise = self.system.diffusion if isinstance(self.system, ContinuousSystem) else self.system.gain
+        when = "a step" if steps else "some time"
+        given = [(self._closed_loop or self.system.dynamics, steps, when), (noise, steps, when)]
+        if self.hold is not None:
+            given.append((self.plan, self.samples, "a sampling time"))
+        for tape, samples, when in given:
+            found = rounded_comparison(tape, float(steps or self.horizon), samples) if isinstance(tape, Tape) else None
+            if found is not None:
+                raise ValueError(
+                    f"the model must not hold a comparison that rounding decides, got {found}: a program takes another "
+                    f"side of it at {when} than exact arithmetic does. Compare with one number (t < 0.3, not "
+                    "t - 0.1 < 0.2), away from steps and sampling times (t < 8.5, not 0.1*t <= 0.9)."
+                )
 
     def _constraints(self) -> tuple[Inside, ...]:
         safe = [self.safe] if isinstance(self.safe, Inside) else self.safe

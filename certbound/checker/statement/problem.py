@@ -20,7 +20,7 @@ from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import Hold, read_hold, read_tape
 from certbound.errors import CertificateError
-from certbound.problem.model import Tape
+from certbound.problem.model import Tape, rounded_comparison
 
 MOST_STATES = 400
 MOST_STEPS = 100_000
@@ -174,7 +174,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     if domain is not None:
         budget.hold(n * n // 4 + 1)
         constraints.append(Constraint.of_domain(domain))
-    return Model(
+    model = Model(
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
         ends=record["leaving"] == "ends", states=states, hold=hold,
         plan=_plan(record, len(inputs) if hold is None else 0, continuous, horizon),
@@ -186,6 +186,20 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         constraints=tuple(constraints), domain=domain,
         stays="reach" in record.value and record["reach"].get("kind") == _STAYING,
     )
+    _refuse_rounding(model, path)
+    return model
+
+
+def _refuse_rounding(model: Model, path: str) -> None:
+    """CertificateError where a program that rounds takes another side of a comparison than exact arithmetic does."""
+    steps = 0 if model.continuous else int(min(model.horizon, MOST_STEPS))
+    given: list[tuple[object, int]] = [(model.dynamics, steps), (model.noise.diffusion, steps)]
+    if model.hold is not None:
+        given.append((model.hold.law, model.hold.count))
+    for tape, samples in given:
+        found = rounded_comparison(tape, float(steps or model.horizon), samples) if isinstance(tape, Tape) else None
+        if found is not None:
+            raise CertificateError(f"`{path}` must not hold a comparison that rounding decides, got {found}.")
 
 
 def _unit(record: Record, continuous: bool) -> str:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         undefined_where,
     )
     from certbound.problem.model.recombined import in_logarithms, turned_tape
+    from certbound.problem.model.rounding import rounded_comparison
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.time_jumps import Change, between_jumps, cut_at_jumps
     from certbound.problem.model.tracing import trace
@@ -50,6 +51,7 @@ _HOME = {
     "network_data": "PARTS Layer Network Part",
     "recombined": "in_logarithms turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
+    "rounding": "rounded_comparison",
     "tape": "ARITY JUMPS Node Tape needed",
     "time_jumps": "between_jumps Change cut_at_jumps",
     "tracing": "trace",
@@ -83,6 +85,7 @@ __all__ = [
     "Part",
     "PARTS",
     "relaxed",
+    "rounded_comparison",
     "ROWS",
     "selected",
     "sources",

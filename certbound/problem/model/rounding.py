@@ -1,0 +1,279 @@
+"""Comparisons that rounding decides: exact arithmetic and a program that rounds would take different sides.
+
+A tape means what it says in exact arithmetic, every constant being its float. A program rounds every operation. Where
+the sides of a comparison differ by a function of time that crosses 0 steeply, both jump at nearly the same time. Where
+they differ by no more than what rounding adds, at all times or at a time that is a whole step, they take different
+sides there: ``(t - 0.1) < 0.2 + (t - 0.3)`` is true at all times, and a program says so at some of them.
+
+Every node is an affine form in the inputs and in whatever is not affine, in fractions, with a bound of its rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from certbound.problem.model.analysis import reads
+from certbound.problem.model.tape import Node, Tape, needed
+
+_UNIT = Fraction(1, 2**53)
+_LOOSE = Fraction(1, 2**40)  # relative error of constants that are no sums, products or quotients
+_STEEP = 2**30  # a difference that changes by more than so many rounding errors crosses 0 where it should
+_STEEP_IN_STATES = 2**10  # the same in what else it depends on, whose size is taken for 1
+_MOST_STEPS = 100_000
+_LONGEST = 2**20  # seconds, or steps, after which nothing is looked at
+_MOST_BITS, _MOST_ATOMS = 4096, 64
+_TIME = ("input", 0)
+_TRUTHS = ("lt", "le", "eq", "ne")
+_DECIDING = (*_TRUTHS, "sign", "floor")
+
+Atom = tuple[object, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """slopes . atoms + offset, computed with an error of at most ``error``.
+
+    Of a constant ``value`` is what a program computes; ``loose``: the offset is that too, and no exact value.
+    """
+
+    slopes: dict[Atom, Fraction]
+    offset: Fraction
+    error: Fraction
+    value: float | None = None
+    loose: bool = False
+
+    def size(self, horizon: Fraction) -> Fraction:
+        """Bound of the absolute value; atoms beside time are taken for at most 1."""
+        return abs(self.offset) + self.change(horizon)
+
+    def change(self, horizon: Fraction) -> Fraction:
+        """By how much it may change."""
+        return sum((abs(a) * (horizon if atom == _TIME else 1) for atom, a in self.slopes.items()), Fraction(0))
+
+
+_NOTHING = _Form({}, Fraction(0), Fraction(0))
+
+
+def rounded_comparison(tape: Tape, horizon: float, samples: int = 0) -> str | None:
+    """The first comparison of the tape that rounding decides, in words; None where there is none.
+
+    Parameters
+    ----------
+    tape : Tape
+        Its first input is t.
+    horizon : float
+        The length of time.
+    samples : int
+        Where t is one of the ends of so many equal parts of the horizon only: the number of steps, or of holds.
+    """
+    if not any(node.op in _DECIDING for node in tape.nodes):
+        return None
+    discrete = samples == horizon
+    whole = min(Fraction(horizon), Fraction(_LONGEST)) if math.isfinite(horizon) else Fraction(_LONGEST)
+    clock = _Clock(whole, min(samples, _LONGEST) if discrete else samples)
+    seen = reads(tape)
+    forms: list[_Form] = []
+    names: dict[Atom, Atom] = {}
+    deciding = [index for index, node in enumerate(tape.nodes) if node.op in _DECIDING]
+    for index, (node, used) in enumerate(zip(tape.nodes, needed(tape.nodes, deciding))):
+        if not used:
+            forms.append(_NOTHING)
+            continue
+        if node.op in _DECIDING:
+            given = [forms[arg] for arg in node.args]
+            over = given[0] if len(given) == 1 else _sum(given[0], given[1], -1, clock.whole, rounds=False)
+            if _unclear(tape, index, over, seen, clock):
+                return tape.describe(index)
+        forms.append(_form(node, index, forms, names, clock.whole, constant=not seen[index]))
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """Times that are looked at: all up to ``whole``, or the ends of ``samples`` equal parts."""
+
+    whole: Fraction
+    samples: int
+
+    def exact(self, k: int) -> Fraction:
+        """The end of part k."""
+        return self.whole * k / self.samples
+
+    def rounded(self, k: int) -> set[float]:
+        """What programs take for it."""
+        whole = float(self.whole)
+        return {k * (whole / self.samples), k * whole / self.samples, float(self.exact(k))}
+
+
+def _form(
+    node: Node, index: int, forms: Sequence[_Form], names: dict[Atom, Atom], whole: Fraction, *, constant: bool
+) -> _Form:
+    if node.op == "const":
+        return _Form({}, Fraction(node.value), Fraction(0), node.value)
+    if node.op == "input":
+        return _Form({("input", node.args[0]): Fraction(1)}, Fraction(0), Fraction(0))
+    given = [forms[arg] for arg in node.args]
+    made = _affine(node.op, given, whole)
+    if made is not None and made.offset.denominator.bit_length() < _MOST_BITS and len(made.slopes) <= _MOST_ATOMS:
+        return made
+    error = max((form.error for form in given), default=Fraction(0))
+    if constant and (known := _constant(node, given)) is not None:
+        return known
+    key = (node.op, node.value, node.part, *((*form.slopes.items(), form.offset) for form in given))
+    return _Form({names.setdefault(key, ("node", index)): Fraction(1)}, Fraction(0), error)
+
+
+def _affine(op: str, given: Sequence[_Form], whole: Fraction) -> _Form | None:
+    """Sums, and products and quotients by constants."""
+    a, b = given[0], given[-1]
+    if op == "neg":
+        return _scaled(a, Fraction(-1), Fraction(0), None if a.value is None else -a.value, whole, loose=a.loose)
+    if op in ("add", "sub"):
+        return _sum(a, b, 1 if op == "add" else -1, whole)
+    if op == "mul" and a.slopes and not b.slopes:
+        a, b = b, a
+    if op == "mul" and not a.slopes or op == "sq" and not a.slopes:
+        value = None if a.value is None or b.value is None else a.value * b.value
+        return _scaled(b, a.offset, a.error, value, whole, loose=a.loose or b.loose)
+    if op == "div" and not b.slopes and b.offset:
+        factor, error = 1 / b.offset, b.error / b.offset**2 * 2
+        value = None if a.value is None or not b.value else a.value / b.value
+        return _scaled(a, factor, error, value, whole, loose=a.loose or b.loose)
+    return None
+
+
+def _sum(a: _Form, b: _Form, sign: int, whole: Fraction, *, rounds: bool = True) -> _Form:
+    slopes = dict(a.slopes)
+    for atom, x in b.slopes.items():
+        slopes[atom] = slopes.get(atom, Fraction(0)) + sign * x
+    slopes = {atom: x for atom, x in slopes.items() if x}
+    value = None if a.value is None or b.value is None else a.value + sign * b.value
+    found = _Form(slopes, a.offset + sign * b.offset, a.error + b.error, value, a.loose or b.loose)
+    return _rounded(found, found.size(whole)) if rounds else found
+
+
+def _scaled(
+    a: _Form, factor: Fraction, error: Fraction, value: float | None, whole: Fraction, *, loose: bool
+) -> _Form:
+    own = abs(factor) * a.error + error * a.size(whole)
+    found = _Form({atom: factor * x for atom, x in a.slopes.items() if factor}, factor * a.offset, own, value, loose)
+    parts = (abs(factor.numerator), factor.denominator)
+    power = all(part & (part - 1) == 0 for part in parts)  # of two: nothing is rounded
+    return found if power else _rounded(found, found.size(whole))
+
+
+def _rounded(found: _Form, size: Fraction) -> _Form:
+    """With the error of one rounding more; a constant that is a float has none."""
+    exact = not found.slopes and not found.error and _is_float(found.offset)
+    return found if exact else replace(found, error=found.error + _UNIT * size)
+
+
+def _is_float(value: Fraction) -> bool:
+    try:
+        return Fraction(float(value)) == value
+    except OverflowError:
+        return False
+
+
+def _constant(node: Node, given: Sequence[_Form]) -> _Form | None:
+    """A constant that is no sum, product or quotient, about what a program computes; None where it computes none."""
+    values = [form.value for form in given if form.value is not None]
+    if len(values) < len(given):
+        return None
+    value = _computed(node, values)
+    if value is None or not math.isfinite(value):
+        return None
+    plain = node.op in (*_DECIDING, "and", "or", "not", "min", "max", "abs", "if_else_zero")
+    error = max((form.error for form in given), default=Fraction(0))
+    loose = not plain or error > 0
+    return _Form({}, Fraction(value), error if plain else error + _LOOSE * abs(Fraction(value)), value, loose)
+
+
+def _computed(node: Node, values: Sequence[float]) -> float | None:
+    """What a program computes; None where it fails, or nothing is known of the operation."""
+    a, b = values[0], values[-1]
+    rules = {
+        "neg": lambda: -a, "add": lambda: a + b, "sub": lambda: a - b, "mul": lambda: a * b, "div": lambda: a / b,
+        "sq": lambda: a * a, "pow": lambda: a**node.value, "abs": lambda: abs(a), "floor": lambda: math.floor(a),
+        "sign": lambda: (a > 0) - (a < 0), "min": lambda: min(a, b), "max": lambda: max(a, b), "lt": lambda: a < b,
+        "le": lambda: a <= b, "eq": lambda: a == b, "ne": lambda: a != b, "and": lambda: bool(a) and bool(b),
+        "or": lambda: bool(a) or bool(b), "not": lambda: not a, "if_else_zero": lambda: b if a else 0.0,
+    }  # fmt: skip
+    rule = rules.get(node.op) or getattr(math, node.op, None)
+    if rule is None or node.part is not None:
+        return None
+    try:
+        return float(rule() if node.op in rules else rule(*values))
+    except (ArithmeticError, TypeError, ValueError):
+        return None
+
+
+def _unclear(tape: Tape, index: int, over: _Form, seen: Sequence[set[int]], clock: _Clock) -> bool:
+    """Whether rounding may decide what is compared with 0 (``floor``: with whole numbers)."""
+    op, own = tape.nodes[index].op, seen[index]
+    if not own and not over.slopes and over.value is not None:
+        near = over.loose and _decides(op, over, Fraction(0))
+        return near or _side(op, over.offset) != _side(op, Fraction(over.value))
+    if clock.samples and own == {0} and (_TIME in over.slopes or op == "floor"):
+        return any(_differs(tape, index, over, k, clock) for k in _near(op, over, clock))
+    change = over.change(clock.whole)
+    other = any(atom != _TIME for atom in over.slopes)
+    steep = change > over.error * (_STEEP_IN_STATES if other else _STEEP)
+    return bool(over.error) and not steep and _decides(op, over, change)
+
+
+def _decides(op: str, over: _Form, change: Fraction) -> bool:
+    """Whether the error meets what is compared with, somewhere."""
+    low, high = over.offset - change - over.error, over.offset + change + over.error
+    return math.floor(high) >= math.ceil(low) if op == "floor" else low <= 0 <= high
+
+
+def _side(op: str, value: Fraction) -> int:
+    """What the operation says of a difference."""
+    if op in _TRUTHS:
+        return {"lt": value < 0, "le": value <= 0, "eq": value == 0, "ne": value != 0}[op]
+    return math.floor(value) if op == "floor" else (value > 0) - (value < 0)
+
+
+def _near(op: str, over: _Form, clock: _Clock) -> Iterator[int]:
+    """Numbers of times next to those at which the difference is what it is compared with; only lines are looked at."""
+    slope = over.slopes.get(_TIME, Fraction(0))
+    if {*over.slopes} - {_TIME} or (not over.error and clock.whole == clock.samples):
+        return
+    step, offset = float(slope * clock.whole / clock.samples), float(over.offset)
+    if op == "floor":
+        wide = 1e-9 * (1 + abs(step) * clock.samples + abs(offset))
+        for k in range(min(clock.samples, _MOST_STEPS) + 1):
+            value = offset + k * step
+            if abs(value - round(value)) <= wide:
+                yield k
+        return
+    root = -over.offset * clock.samples / (slope * clock.whole)
+    yield from (k for k in range(math.floor(root), math.floor(root) + 2) if 0 <= k <= clock.samples)
+
+
+def _differs(tape: Tape, index: int, over: _Form, k: int, clock: _Clock) -> bool:
+    """Whether a program takes another side at a time than exact arithmetic does."""
+    op = tape.nodes[index].op
+    side = _side(op, over.offset + over.slopes.get(_TIME, Fraction(0)) * clock.exact(k))
+    return any(_program_side(tape, index, time) != side for time in clock.rounded(k))
+
+
+def _program_side(tape: Tape, index: int, time: float) -> int | None:
+    """The side that a program takes at a time; None where nothing is known."""
+    values: list[float | None] = []
+    for node in tape.nodes[:index]:
+        given = [values[arg] for arg in node.args] if node.op != "input" else []
+        known = [value for value in given if value is not None]
+        if node.op in ("const", "input"):
+            values.append(node.value if node.op == "const" else time if node.args == (0,) else None)
+        else:
+            values.append(_computed(node, known) if len(known) == len(given) else None)
+    first, last = (values[place] for place in (tape.nodes[index].args[0], tape.nodes[index].args[-1]))
+    if first is None or last is None:
+        return None
+    op = tape.nodes[index].op
+    return _side(op, Fraction(first) - (Fraction(last) if len(tape.nodes[index].args) == 2 else 0))
