@@ -324,6 +324,8 @@ class Problem(Shown):
         given = [(self._closed_loop or self.system.dynamics, steps, when), (noise, steps, when)]
         if self.hold is not None:
             given.append((self.plan, self.samples, "a sampling time"))
+        sets = [constraint.region for constraint in (*self.safe, *([self.reach] if self.reach is not None else []))]
+        given += [(getattr(region, "center", None), steps, when) for region in sets]
         for tape, samples, when in given:
             found = rounded_comparison(tape, float(steps or self.horizon), samples) if isinstance(tape, Tape) else None
             if found is not None:

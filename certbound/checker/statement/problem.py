@@ -196,6 +196,8 @@ def _refuse_rounding(model: Model, path: str) -> None:
     given: list[tuple[object, int]] = [(model.dynamics, steps), (model.noise.diffusion, steps)]
     if model.hold is not None:
         given.append((model.hold.law, model.hold.count))
+    sets = [*model.constraints, *([] if model.target is None else [model.target])]
+    given += [(constraint.region.center, steps) for constraint in sets]
     for tape, samples in given:
         found = rounded_comparison(tape, float(steps or model.horizon), samples) if isinstance(tape, Tape) else None
         if found is not None:

@@ -187,13 +187,13 @@ def _jumps_within(tape: Tape, own: Sequence[int], first: Fraction, last: Fractio
 
 
 def _touches(tape: Tape, own: Sequence[int], horizon: Fraction) -> bool:
-    """Whether something jumps at time 0 or at the end: inside of the closed piece nothing decides it there."""
+    """Whether something jumps next to time 0 or the end: inside of the closed piece rounded times decide nothing."""
     lines: dict[int, Line | None] = {}
     for index in own:
         node = tape.nodes[index]
         if node.op in _CUT and all(lines.get(arg) is not None for arg in node.args):
             around = _crossings(node.op, _compared(node, lines), Fraction(-1), horizon + 1)
-            if not {Fraction(0), horizon}.isdisjoint(around):
+            if any(abs(time - end) <= _NEAR * horizon for time in around for end in (0, horizon)):
                 return True
         lines[index] = _line(node, lines, horizon / 2)
     return False
