@@ -2,8 +2,8 @@
 
 A proof names the number of pieces. That no such jump lies inside one is looked at piece by piece, in fractions; what
 jumps at their ends is an input from then on, as the rows of a plan are. The one time of a jump has no weight. A number
-is its float, exactly. A jump may miss the end of its piece by rounding, at most by the share `NEAR` of the horizon: about
-every end the model's `changes` say from when to when, and which values inputs have there, for proofs to pay for it.
+is its float, exactly. A jump may miss the end of its piece by rounding, at most by the share `NEAR` of the horizon:
+about every end the model's `changes` say from when to when, and which values inputs have there, for proofs to pay for.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
         about.append(_about(tape, timed, max(end - near, Fraction(0)), min(end + near, horizon)))
         if k < count:
             inside.append(_values(tape, timed, end + near, ends[k + 1] - near)[0])
-    found = {
-        index: _Course(
-            tuple(row[index] for row in inside), tuple(tuple(row[index] for row in rows) for _, rows in about)
-        )
-        for index in jumps if tape.nodes[index].op != _CHOICE
-    }  # fmt: skip
-    return _replaced(model, {index: course for index, course in found.items() if course.known}, ends, [x for x, _ in about])
+    courses = {}
+    for index in jumps:
+        rows = tuple(tuple(row[index] for row in own) for _, own in about)
+        course = _Course(tuple(row[index] for row in inside), rows)
+        if course.known and tape.nodes[index].op != _CHOICE:
+            courses[index] = course
+    return _replaced(model, courses, ends, [breaks for breaks, _ in about])
 
 
 class _Course(NamedTuple):
@@ -116,7 +116,8 @@ def _crossing(op: str, given: Sequence[Ends], first: Fraction, last: Fraction) -
     """A time inside at which what jumps or bends crosses 0 (``floor``: a whole number)."""
     start, end = (a - b for a, b in zip(*given)) if len(given) == 2 else given[0]
     level = Fraction(math.floor(min(start, end)) + 1) if op == "floor" else Fraction(0)
-    return first + (last - first) * (level - start) / (end - start) if min(start, end) < level < max(start, end) else None
+    crossed = min(start, end) < level < max(start, end)
+    return first + (last - first) * (level - start) / (end - start) if crossed else None
 
 
 def _timed(tape: Tape) -> list[int]:

@@ -69,7 +69,10 @@ def checked_hold(value: Any, plan: Any, system: System, horizon: float) -> float
 
 
 def samples_of(hold: float, horizon: float) -> int | None:
-    """How often ``hold`` fits into the horizon, up to rounding; None if not. The samples are equal parts of the horizon."""
+    """How often ``hold`` fits into the horizon, up to rounding; None if not.
+
+    The samples are at the ends of as many equal parts of the horizon.
+    """
     count = round(horizon / hold)
     missed = abs(count * Fraction(hold) - Fraction(horizon))
     return count if count and missed <= _ROUNDED * Fraction(horizon) else None

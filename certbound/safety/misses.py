@@ -51,9 +51,9 @@ def _at_sample(problem: Problem) -> float:
     found = [float(time) for time in samples if Fraction(float(time)) == time]
     if not found:
         raise EngineError(
-            f"the target counts from {float(first):g} to {float(last):g}, and inputs, which are held for "
-            f"{problem.hold:g}, are computed at no time there that is exactly a float; let its `during` hold one: the "
-            "horizon, or a multiple of the hold that is a whole number, a half, a quarter, ..."
+            f"the target counts from {float(first):g} to {float(last):g}, when no inputs are computed, which are held "
+            f"for {problem.hold:g}, at a time that is exactly a float; let its `during` hold a multiple of that which "
+            "is one, such as the horizon."
         )
     times, _, _, paths, flow = _followed(problem.replace(hold=None))
     depth = rooms(Inside(problem.reach.region, (0.0, times[-1])), flow, times, paths).min(axis=0)

@@ -5,8 +5,8 @@ In continuous time such a jump is no hindrance: what the model says at the one t
 horizon is cut into equal pieces that have the jumps at their ends, and what jumps becomes an input with a value a
 piece, as the rows of an array plan are.
 
-A number is the float that it is read as, exactly: everything here is computed in fractions. The ends of equal pieces may
-miss a jump by rounding (0.3 is no tenth of a second): a `Change` says when the function really jumps, and to what.
+A number is the float that it is read as, exactly: everything here is computed in fractions. The ends of equal pieces
+may miss a jump by rounding (0.3 is no tenth of a second): a `Change` says when the function really jumps, and to what.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from certbound.problem.model.analysis import reads
 from certbound.problem.model.tape import Node, Tape, needed
 
 _UNIT = Fraction(1, 2**53)
@@ -74,7 +73,7 @@ def rounded_comparison(tape: Tape, horizon: float, samples: int = 0) -> str | No
     discrete = samples == horizon
     whole = min(Fraction(horizon), Fraction(_LONGEST)) if math.isfinite(horizon) else Fraction(_LONGEST)
     clock = _Clock(whole, min(samples, _LONGEST) if discrete else samples)
-    seen = reads(tape)
+    seen = _reads(tape)
     forms: list[_Form] = []
     names: dict[Atom, Atom] = {}
     deciding = [index for index, node in enumerate(tape.nodes) if node.op in _DECIDING]
@@ -108,6 +107,14 @@ class _Clock:
         return {k * (whole / self.samples), k * whole / self.samples, float(self.exact(k))}
 
 
+def _reads(tape: Tape) -> list[set[int]]:
+    """Input slots that each node depends on."""
+    found: list[set[int]] = []
+    for node in tape.nodes:
+        found.append({node.args[0]} if node.op == "input" else set().union(*(found[arg] for arg in node.args)))
+    return found
+
+
 def _form(
     node: Node, index: int, forms: Sequence[_Form], names: dict[Atom, Atom], whole: Fraction, *, constant: bool
 ) -> _Form:
@@ -135,7 +142,7 @@ def _affine(op: str, given: Sequence[_Form], whole: Fraction) -> _Form | None:
         return _sum(a, b, 1 if op == "add" else -1, whole)
     if op == "mul" and a.slopes and not b.slopes:
         a, b = b, a
-    if op == "mul" and not a.slopes or op == "sq" and not a.slopes:
+    if op in ("mul", "sq") and not a.slopes:
         value = None if a.value is None or b.value is None else a.value * b.value
         return _scaled(b, a.offset, a.error, value, whole, loose=a.loose or b.loose)
     if op == "div" and not b.slopes and b.offset:
