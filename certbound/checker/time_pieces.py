@@ -48,7 +48,7 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
     inside, about = [], []
     for k, end in enumerate(ends):
         budget.check()
-        about.append(_about(tape, timed, max(end - near, Fraction(0)), min(end + near, horizon)))
+        about.append(_about(tape, timed, max(end - near, Fraction(0)), min(end + near, horizon), budget))
         if k < count:
             inside.append(_values(tape, timed, end + near, ends[k + 1] - near)[0])
     courses = {}
@@ -78,11 +78,13 @@ class _Course(NamedTuple):
 
 
 def _about(
-    tape: Tape, timed: Sequence[int], first: Fraction, last: Fraction
+    tape: Tape, timed: Sequence[int], first: Fraction, last: Fraction, budget: Budget
 ) -> tuple[list[Fraction], list[dict[int, float | None]]]:
     """Times about the end of a piece at which something jumps or bends, and the values from one to the next."""
-    breaks, rows, place = [first, last], [], 0
+    breaks, place = [first, last], 0
+    rows: list[dict[int, float | None]] = []
     while place + 1 < len(breaks):
+        budget.check()
         values, jump = _values(tape, timed, *breaks[place : place + 2])
         if jump is None or len(breaks) > _MOST_BREAKS:
             rows.append(values)

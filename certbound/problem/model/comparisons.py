@@ -23,7 +23,8 @@ _STEEP = 2**30  # a difference that changes by more than so many rounding errors
 _STEEP_IN_STATES = 2**10  # the same in what else it depends on, whose size is taken for 1
 _MOST_STEPS = 100_000
 _LONGEST = 2**20  # seconds, or steps, after which nothing is looked at
-_MOST_BITS, _MOST_ATOMS = 4096, 64
+_MOST_BITS, _MOST_ATOMS = 4096, 16
+_MOST_WORK = 4_000_000  # numbers that are computed for the times of one tape
 _TIME = ("input", 0)
 _TRUTHS = ("lt", "le", "eq", "ne")
 _DECIDING = (*_TRUTHS, "sign", "floor")
@@ -43,6 +44,13 @@ class _Form:
     error: Fraction
     value: float | None = None
     loose: bool = False
+
+    @property
+    def small(self) -> bool:
+        """Whether it may be used further: what has no end of digits or parts is no line."""
+        numbers = (self.offset, self.error, *self.slopes.values())
+        sizes = (part.bit_length() for number in numbers for part in (number.numerator, number.denominator))
+        return len(self.slopes) <= _MOST_ATOMS and max(sizes) < _MOST_BITS
 
     def size(self, horizon: Fraction) -> Fraction:
         """Bound of the absolute value; atoms beside time are taken for at most 1."""
@@ -90,12 +98,18 @@ def rounded_comparison(tape: Tape, horizon: float, samples: int = 0) -> str | No
     return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Clock:
-    """Times that are looked at: all up to ``whole``, or the ends of ``samples`` equal parts."""
+    """Times that are looked at: all up to ``whole``, or the ends of ``samples`` equal parts; and the work left."""
 
     whole: Fraction
     samples: int
+    work: int = _MOST_WORK
+
+    def spend(self, work: int) -> bool:
+        """Whether there is so much work left."""
+        self.work -= work
+        return self.work >= 0
 
     def exact(self, k: int) -> Fraction:
         """The end of part k."""
@@ -124,7 +138,7 @@ def _form(
         return _Form({("input", node.args[0]): Fraction(1)}, Fraction(0), Fraction(0))
     given = [forms[arg] for arg in node.args]
     made = _affine(node.op, given, whole)
-    if made is not None and made.offset.denominator.bit_length() < _MOST_BITS and len(made.slopes) <= _MOST_ATOMS:
+    if made is not None and made.small:
         return made
     error = max((form.error for form in given), default=Fraction(0))
     if constant and (known := _constant(node, given)) is not None:
@@ -225,7 +239,14 @@ def _unclear(tape: Tape, index: int, over: _Form, seen: Sequence[set[int]], cloc
         near = over.loose and _decides(op, over, Fraction(0))
         return near or _side(op, over.offset) != _side(op, Fraction(over.value))
     if clock.samples and own == {0} and (_TIME in over.slopes or op == "floor"):
-        return any(_differs(tape, index, over, k, clock) for k in _near(op, over, clock))
+        part = _part(tape, index)
+        wide = clock.samples if op == "floor" else 1
+        if not clock.spend(wide):
+            return True
+        for k in _near(op, over, clock):
+            if not clock.spend(3 * len(part)) or _differs(tape, part, over, k, clock):
+                return True
+        return False
     change = over.change(clock.whole)
     other = any(atom != _TIME for atom in over.slopes)
     steep = change > over.error * (_STEEP_IN_STATES if other else _STEEP)
@@ -262,25 +283,31 @@ def _near(op: str, over: _Form, clock: _Clock) -> Iterator[int]:
     yield from (k for k in range(math.floor(root), math.floor(root) + 2) if 0 <= k <= clock.samples)
 
 
-def _differs(tape: Tape, index: int, over: _Form, k: int, clock: _Clock) -> bool:
-    """Whether a program takes another side at a time than exact arithmetic does."""
-    op = tape.nodes[index].op
+def _part(tape: Tape, index: int) -> list[int]:
+    """The nodes that a node needs, and itself."""
+    return [place for place, used in enumerate(needed(tape.nodes[: index + 1], [index])) if used]
+
+
+def _differs(tape: Tape, part: Sequence[int], over: _Form, k: int, clock: _Clock) -> bool:
+    """Whether a program takes another side at a time than exact arithmetic does, for the last node of a part."""
+    op = tape.nodes[part[-1]].op
     side = _side(op, over.offset + over.slopes.get(_TIME, Fraction(0)) * clock.exact(k))
-    return any(_program_side(tape, index, time) != side for time in clock.rounded(k))
+    return any(_program_side(tape, part, time) != side for time in clock.rounded(k))
 
 
-def _program_side(tape: Tape, index: int, time: float) -> int | None:
+def _program_side(tape: Tape, part: Sequence[int], time: float) -> int | None:
     """The side that a program takes at a time; None where nothing is known."""
-    values: list[float | None] = []
-    for node in tape.nodes[:index]:
+    values: dict[int, float | None] = {}
+    for place in part[:-1]:
+        node = tape.nodes[place]
         given = [values[arg] for arg in node.args] if node.op != "input" else []
         known = [value for value in given if value is not None]
         if node.op in ("const", "input"):
-            values.append(node.value if node.op == "const" else time if node.args == (0,) else None)
+            values[place] = node.value if node.op == "const" else time
         else:
-            values.append(_computed(node, known) if len(known) == len(given) else None)
-    first, last = (values[place] for place in (tape.nodes[index].args[0], tape.nodes[index].args[-1]))
-    if first is None or last is None:
+            values[place] = _computed(node, known) if len(known) == len(given) else None
+    last = tape.nodes[part[-1]]
+    found = [value for value in (values[arg] for arg in last.args) if value is not None]
+    if len(found) < len(last.args) or not all(map(math.isfinite, found)):
         return None
-    op = tape.nodes[index].op
-    return _side(op, Fraction(first) - (Fraction(last) if len(tape.nodes[index].args) == 2 else 0))
+    return _side(last.op, Fraction(found[0]) - (Fraction(found[1]) if len(found) == 2 else 0))
