@@ -67,6 +67,8 @@ def tape(written: Written) -> Tape:
         lambda t, x, c: (x + 1e16) - 1e16 < 0.3,
         lambda t, x, c: t.of("eq", t / 3 * 3, t),
         lambda t, x, c: t.of("floor", t * 3 - (t + t + t) + 1.0),
+        lambda t, x, c: t.of("min", t, 0.1) < c(0.1) + 0.3 - 0.3,
+        lambda t, x, c: x <= ((t.of("min", x, 0.7) + 3) - 3) + 10 - 10,
     ],
 )
 def test_sides_that_differ_by_what_rounding_adds_are_found(written: Written) -> None:
@@ -94,6 +96,8 @@ def test_where_both_take_one_side_but_for_an_instant_nothing_is_found(written: W
         (lambda t, x, c: c(0.1) * t <= 0.9, True), (lambda t, x, c: t.of("floor", c(0.7) * t), True),
         (lambda t, x, c: t - 0.1 < c(0.2) + t - 0.3, True), (lambda t, x, c: t < 5, False),
         (lambda t, x, c: t * 0.5 <= 4.5, False), (lambda t, x, c: t / 10 < 0.35, False),
+        (lambda t, x, c: t - t.of("floor", t / 0.3) * 0.3 < 0.1, True),
+        (lambda t, x, c: (t - t.of("floor", t / 3) * 3) / 10 < 0.2, True),
         (lambda t, x, c: t.of("floor", t / 10), False), (lambda t, x, c: c(0.1) * t <= 0.85, False),
     ],
 )
