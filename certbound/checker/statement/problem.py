@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from flint import arb, arb_mat
 
@@ -17,6 +18,7 @@ from certbound.checker.statement.law_pieces import Piece
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import Hold, read_hold, read_tape
+from certbound.checker.words import quoted, shortened
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
@@ -177,12 +179,26 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
 
 
 def _unit(record: Record, continuous: bool) -> str:
-    """The unit of time, for the words of the claim; of the others nothing is made."""
+    """The unit of time, for the words of the claim, in quotes if it is the file's; of the others nothing is made."""
     units = record["units"] or {}
     if not isinstance(units, dict) or len(units) > MOST_STATES:
         raise CertificateError(f"`{record.at('units')}` must be texts by names.")
     own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
-    return own.get("time", "s" if continuous else "steps")
+    return quoted(own["time"]) if "time" in own else "s" if continuous else "steps"
+
+
+def named_as(model: Model, problem: Mapping[str, Any]) -> Model:
+    """The model of a certificate by the name and the labels of a problem's data, where both state the same problem.
+
+    Nothing compares what is for humans, so that a file may say there what it likes.
+    """
+    labels = [shortened(str(row.get("label", ""))) for row in problem["constraints"]]
+    own = [replace(constraint, label=label) for constraint, label in zip(model.constraints, labels)]
+    target = model.target
+    if target is not None:
+        target = replace(target, label=shortened(str(problem["reach"].get("label", ""))))
+    constraints = (*own, *model.constraints[len(own) :])  # the domain stands behind them
+    return replace(model, name=str(problem.get("name", "")), constraints=constraints, target=target)
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:
