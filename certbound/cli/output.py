@@ -32,6 +32,8 @@ class Settings:
     json: bool = False
     answered: bool = False
     """Whether the one JSON object of ``--json`` has been printed."""
+    began: float | None = None
+    """Since when limits of time count, by ``time.perf_counter``; None between commands."""
 
 
 SETTINGS = Settings()

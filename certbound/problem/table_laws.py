@@ -44,7 +44,7 @@ class _Table(Law):
             )
         if extra or not len(weights):
             raise ValueError(
-                f"`probabilities` of {kind} must have one entry for each of `{where}`"
+                f"`probabilities` of {kind} must have entries, one for each of `{where}`"
                 f"{'' if len(self._middles) == len(places) else ' but one'}, got {len(weights)} for {len(places)}."
             )
         if np.any(weights < 0):

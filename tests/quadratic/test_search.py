@@ -181,7 +181,7 @@ def test_better_bounds_are_told_and_the_end_of_the_time_is_kept() -> None:
 
 
 def test_a_search_goes_on_from_an_earlier_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock of the search counts programs here, a second each: no machine is too slow for six of them, where it takes four."""
+    """The clock of the search counts programs here, a second each: to go on takes four of six, on any machine."""
     clock = itertools.count()
     solved = [0.0]
 

@@ -242,7 +242,7 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
         return Noise(diffusion=drives, proxy=diagonal([arb(1)] * m), gaussian=True)
     name = text(value.get("law") if isinstance(value, dict) else None, f"{path}.law", 200)
     if name not in LAWS:
-        raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {name[:40]!r}.")
+        raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {quoted(name, 40)}.")
     law = LAWS[name]
     tables = ("tables",) if law.tables else ()
     record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
@@ -280,7 +280,8 @@ def _proxy(record: Record, law: Law, m: int, budget: Budget) -> tuple[arb_mat | 
     """The variance proxy that is proved of a law (None: it has none), and the sizes of entries that are independent."""
     level = record.text("level")
     if level not in law.levels:
-        raise CertificateError(f"`{record.at('level')}` must be one of {', '.join(law.levels)}, got {level[:40]!r}.")
+        known = ", ".join(law.levels)
+        raise CertificateError(f"`{record.at('level')}` must be one of {known}, got {quoted(level, 40)}.")
     if level == "covariance":
         found = _semidefinite(matrix(record.symmetric("values", m)), record.at("values"), budget)
         alone = all(found[i, j].is_zero() for i in range(m) for j in range(i))
