@@ -39,7 +39,7 @@ from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, structure_of
-from certbound.checker.words import quoted
+from certbound.checker.words import named
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
@@ -327,16 +327,16 @@ class _Cell:
             polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame, sides=sides)
             least, most = (self.low[k][i] * scale).upper(), (self.high[k][i] * scale).lower()
             if not output.prove(polytope, least, most, self.budget):
-                name = quoted(self.model.states[i], 20)
+                name = named(self.model.states[i])
                 at = f"piece {k}" if self.model.continuous else f"step {k}"
                 raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
 
     def _jumping(self, i: int, hidden: Sequence[int]) -> str:
         """What is not proved where state i may jump with inputs that it is linear in otherwise."""
         inputs = self.model.dynamics.inputs
-        names = ", ".join(quoted(inputs[slot], 20) for slot in hidden[:MOST_NAMED])
+        names = ", ".join(named(inputs[slot]) for slot in hidden[:MOST_NAMED])
         more = " and others" if len(hidden) > MOST_NAMED else ""
-        return f"{quoted(self.model.states[i], 20)} may jump with {names}{more}, in which it is linear otherwise"
+        return f"{named(self.model.states[i])} may jump with {names}{more}, in which it is linear otherwise"
 
     def _data(self, k: int) -> PieceData:
         """The parameters of the remainder's expressions."""

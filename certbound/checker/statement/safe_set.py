@@ -11,7 +11,7 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
 from certbound.checker.statement.rooms import Grid, centres_of
-from certbound.checker.words import quoted
+from certbound.checker.words import named
 from certbound.problem.model import Tape
 
 _MOST_BOXES = 20_000
@@ -164,9 +164,9 @@ class SafeSet:
         self.hull: list[Side] = []
         for j, (a, b) in enumerate(zip(low, high) if bounded else ()):
             if a is None or b is None:
-                raise Unproved(f"no constraint that a barrier can use bounds {quoted(model.states[j], 20)}")
+                raise Unproved(f"no constraint that a barrier can use bounds {named(model.states[j])}")
             if not a <= b:
-                raise Unproved(f"no value of {quoted(model.states[j], 20)} is safe")
+                raise Unproved(f"no value of {named(model.states[j])} is safe")
             self.hull.append((a, b))
 
     def _shape(self, constraint: Constraint) -> _Shape | None:
