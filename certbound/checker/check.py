@@ -13,7 +13,7 @@ from flint import arb, ctx
 from certbound.checker.claims import assumptions, check_side, claim, claim_below, engine_of, prove, words_of
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
-from certbound.checker.statement import first_difference, named_as, read_model
+from certbound.checker.statement import first_difference, read_model
 from certbound.checker.words import plainly, rounded, shortened
 from certbound.errors import CertificateError
 
@@ -83,7 +83,7 @@ def check_data(
         check_side(model, proof, least is not None)
         difference = "" if problem is None else first_difference(record["problem"], problem)
         if problem is not None and not difference:
-            model = named_as(model, problem)
+            model = model.named_as(problem)
         words = claim(model, proof, level, assumed) if least is None else claim_below(model, least, assumed)
         answer = partial(_report, claim=words, level=level, least=least, assumed=assumed)
         proved = None

@@ -117,6 +117,19 @@ class Model:
         """Steps of a discrete-time horizon."""
         return int(self.horizon)
 
+    def named_as(self, problem: Mapping[str, Any]) -> Model:
+        """The same by the name and the labels of a problem's data, where both state the same problem.
+
+        Nothing compares what is for humans, so that a file may say there what it likes.
+        """
+        labels = [shortened(str(row.get("label", ""))) for row in problem["constraints"]]
+        own = [replace(constraint, label=label) for constraint, label in zip(self.constraints, labels)]
+        target = self.target
+        if target is not None:
+            target = replace(target, label=shortened(str(problem["reach"].get("label", ""))))
+        constraints = (*own, *self.constraints[len(own) :])  # the domain stands behind them
+        return replace(self, name=str(problem.get("name", "")), constraints=constraints, target=target)
+
 
 def _names(record: Record, name: str, least: int) -> tuple[str, ...]:
     found = tuple(text(item, record.at(name), 200) for item in record.items(name, least, MOST_STATES))
@@ -185,20 +198,6 @@ def _unit(record: Record, continuous: bool) -> str:
         raise CertificateError(f"`{record.at('units')}` must be texts by names.")
     own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
     return quoted(own["time"]) if "time" in own else "s" if continuous else "steps"
-
-
-def named_as(model: Model, problem: Mapping[str, Any]) -> Model:
-    """The model of a certificate by the name and the labels of a problem's data, where both state the same problem.
-
-    Nothing compares what is for humans, so that a file may say there what it likes.
-    """
-    labels = [shortened(str(row.get("label", ""))) for row in problem["constraints"]]
-    own = [replace(constraint, label=label) for constraint, label in zip(model.constraints, labels)]
-    target = model.target
-    if target is not None:
-        target = replace(target, label=shortened(str(problem["reach"].get("label", ""))))
-    constraints = (*own, *model.constraints[len(own) :])  # the domain stands behind them
-    return replace(model, name=str(problem.get("name", "")), constraints=constraints, target=target)
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:
