@@ -92,7 +92,8 @@ cli
 __main__
 """
 CHECKER_ORDER = """
-report reading words
+report words
+reading
 balls expressions
 statement
 constants linear barrier values endless time_pieces

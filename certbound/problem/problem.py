@@ -12,7 +12,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.checks import assign, nearest
-from certbound.display import Shown, amount, ask_later_room, name_text
+from certbound.display import Shown, amount, ask_later_room, name_text, unit_text
 from certbound.errors import InfeasibleError
 from certbound.problem.ingredients import (
     check_dimension,
@@ -191,9 +191,9 @@ class Problem(Shown):
 
     @property
     def time_unit(self) -> str:
-        """The unit of time: ``s`` or ``steps``, unless another one is given."""
+        """The unit of time as sentences name it: ``s`` or ``steps``, unless another one is given."""
         usual = "s" if self.system.time == "continuous" else "steps"
-        return str(self.units.get("time", usual))
+        return unit_text(str(self.units.get("time", usual)))
 
     @property
     def time_axis(self) -> str:

@@ -40,11 +40,14 @@ from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, structure_of
+from certbound.checker.words import named
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
 MOST_ROWS = 64
 MOST_STATES = 100
+MOST_NAMED = 5
+"""Inputs that one message names."""
 _BITS, _MOST_BITS = 128, 3000
 _MILD = 0.25
 """Norm of the slopes times a piece, up to which series run well in the states' own units."""
@@ -321,14 +324,13 @@ class _Cell:
             hidden = hidden_of[i]
             bounded = all(slot > self.model.dimension or slot - 1 in sides for slot in hidden)
             if hidden and not (bounded and output.is_decided(sides)):
-                names = ", ".join(self.model.dynamics.inputs[slot] for slot in hidden)
-                raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
+                raise Unproved(self._jumping(i, hidden))
             frame = self.frames[i] if number_ is None else self.shared.coordinates(output.states)
             polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame, sides=sides)
             least = (self.low[k][i] * scale + jumped[i]).upper()
             most = (self.high[k][i] * scale - jumped[i]).lower()
             if not output.prove(polytope, least, most, self.budget):
-                name = self.model.states[i]
+                name = named(self.model.states[i])
                 at = f"piece {k}" if self.model.continuous else f"step {k}"
                 raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
 
@@ -347,6 +349,13 @@ class _Cell:
         for output in outputs:
             widths.append((output.width(replace(data, values=values), sides) * part).upper())
         return widths
+
+    def _jumping(self, i: int, hidden: Sequence[int]) -> str:
+        """What is not proved where state i may jump with inputs that it is linear in otherwise."""
+        inputs = self.model.dynamics.inputs
+        names = ", ".join(named(inputs[slot]) for slot in hidden[:MOST_NAMED])
+        more = " and others" if len(hidden) > MOST_NAMED else ""
+        return f"{named(self.model.states[i])} may jump with {names}{more}, in which it is linear otherwise"
 
     def _data(self, k: int) -> PieceData:
         """The parameters of the remainder's expressions."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from flint import arb, arb_mat
 
@@ -19,6 +19,7 @@ from certbound.checker.statement.law_pieces import Piece
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import Hold, read_hold, read_tape
+from certbound.checker.words import quoted, shortened
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, rounded_comparison
 
@@ -127,6 +128,19 @@ class Model:
         """Steps of a discrete-time horizon."""
         return int(self.horizon)
 
+    def named_as(self, problem: Mapping[str, Any]) -> Model:
+        """The same by the name and the labels of a problem's data, where both state the same problem.
+
+        Nothing compares what is for humans, so that a file may say there what it likes.
+        """
+        labels = [shortened(str(row.get("label", ""))) for row in problem["constraints"]]
+        own = [replace(constraint, label=label) for constraint, label in zip(self.constraints, labels)]
+        target = self.target
+        if target is not None:
+            target = replace(target, label=shortened(str(problem["reach"].get("label", ""))))
+        constraints = (*own, *self.constraints[len(own) :])  # the domain stands behind them
+        return replace(self, name=str(problem.get("name", "")), constraints=constraints, target=target)
+
 
 def _names(record: Record, name: str, least: int) -> tuple[str, ...]:
     found = tuple(text(item, record.at(name), 200) for item in record.items(name, least, MOST_STATES))
@@ -205,12 +219,12 @@ def _refuse_rounding(model: Model, path: str) -> None:
 
 
 def _unit(record: Record, continuous: bool) -> str:
-    """The unit of time, for the words of the claim; of the others nothing is made."""
+    """The unit of time, for the words of the claim, in quotes if it is the file's; of the others nothing is made."""
     units = record["units"] or {}
     if not isinstance(units, dict) or len(units) > MOST_STATES:
         raise CertificateError(f"`{record.at('units')}` must be texts by names.")
     own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
-    return own.get("time", "s" if continuous else "steps")
+    return quoted(own["time"]) if "time" in own else "s" if continuous else "steps"
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:
@@ -254,7 +268,7 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
         return Noise(diffusion=drives, proxy=diagonal([arb(1)] * m), gaussian=True)
     name = text(value.get("law") if isinstance(value, dict) else None, f"{path}.law", 200)
     if name not in LAWS:
-        raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {name[:40]!r}.")
+        raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {quoted(name, 40)}.")
     law = LAWS[name]
     tables = ("tables",) if law.tables else ()
     record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
@@ -292,7 +306,8 @@ def _proxy(record: Record, law: Law, m: int, budget: Budget) -> tuple[arb_mat | 
     """The variance proxy that is proved of a law (None: it has none), and the sizes of entries that are independent."""
     level = record.text("level")
     if level not in law.levels:
-        raise CertificateError(f"`{record.at('level')}` must be one of {', '.join(law.levels)}, got {level[:40]!r}.")
+        known = ", ".join(law.levels)
+        raise CertificateError(f"`{record.at('level')}` must be one of {known}, got {quoted(level, 40)}.")
     if level == "covariance":
         found = _semidefinite(matrix(record.symmetric("values", m)), record.at("values"), budget)
         alone = all(found[i, j].is_zero() for i in range(m) for j in range(i))

@@ -11,6 +11,7 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
 from certbound.checker.statement.rooms import Grid, centres_of
+from certbound.checker.words import named
 from certbound.problem.model import Tape
 
 _MOST_BOXES = 20_000
@@ -100,7 +101,7 @@ def _shape_of(constraint: Constraint, center: Sequence[arb], dimension: int) -> 
         rows = [region.lift(region.face(number), dimension) for number in range(len(region.faces))]
         bounds, bound = [arb(b) for b in region.bounds], None
         if not rows and not constraint.inside:
-            raise Unproved(f"'{constraint.label}' leaves nothing")
+            raise Unproved(f"\"{constraint.label}\" leaves nothing")
         if not rows:
             return None
     forms = [[(j, x) for j, x in enumerate(row) if not x.is_zero()] for row in rows]
@@ -163,17 +164,17 @@ class SafeSet:
         self.hull: list[Side] = []
         for j, (a, b) in enumerate(zip(low, high) if bounded else ()):
             if a is None or b is None:
-                raise Unproved(f"no constraint that a barrier can use bounds {model.states[j]}")
+                raise Unproved(f"no constraint that a barrier can use bounds {named(model.states[j])}")
             if not a <= b:
-                raise Unproved(f"no value of {model.states[j]} is safe")
+                raise Unproved(f"no value of {named(model.states[j])} is safe")
             self.hull.append((a, b))
 
     def _shape(self, constraint: Constraint) -> _Shape | None:
         region = constraint.region
         if constraint.during is not None:
-            raise Unproved(f"'{constraint.label}' has a time window, which this proof does not treat")
+            raise Unproved(f"\"{constraint.label}\" has a time window, which this proof does not treat")
         if isinstance(region.center, Tape):
-            raise Unproved(f"'{constraint.label}' moves, which this proof does not treat")
+            raise Unproved(f"\"{constraint.label}\" moves, which this proof does not treat")
         return _shape_of(constraint, [arb(value) for value in region.center], self.n)
 
     def _narrow(self, shape: _Shape, low: list[arb | None], high: list[arb | None]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from certbound.checker.expressions import OPERATIONS
 from certbound.checker.reading import Record, number, whole, wholes
 from certbound.checker.reading import entries as listed
+from certbound.checker.words import shortened
 from certbound.errors import CertificateError
 from certbound.problem.model import Layer, Network, Node, Part, Tape, needed
 
@@ -86,7 +87,7 @@ def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[in
     try:
         tape = Tape(inputs=inputs, nodes=tuple(nodes), outputs=tuple(outputs), shape=shape)
     except ValueError as error:
-        raise CertificateError(f"`{path}` is no tape: {error}") from error
+        raise CertificateError(f"`{path}` is no tape: {shortened(str(error), 200)}") from error
     used = needed(tape.nodes, tape.outputs)
     if not all(used):
         raise CertificateError(f"`{path}.nodes[{used.index(False)}]` must go: no output needs it.")
@@ -105,7 +106,7 @@ def _networks(record: Record) -> list[Network]:
         try:
             found.append(Network(layers=tuple(_layer(row) for row in rows)))
         except ValueError as error:
-            raise CertificateError(f"`{path}` is no network: {error}") from error
+            raise CertificateError(f"`{path}` is no network: {shortened(str(error), 200)}") from error
     return found
 
 
