@@ -14,14 +14,15 @@ from certbound.problem.sets.forms import Faces, Region, linear_maximum
 from certbound.problem.sets.regions import Polytope
 
 _SLACK = 2.0**-48
-"""Rounding of a computed face, in units of the numbers that it is computed from."""
+"""Rounding of a side whose normal is rounded, in units of the numbers that it is computed from."""
 
 
 def polygon(vertices: ArrayLike, *, places: Sequence[int] = (0, 1), dimension: int = 2, outward: bool) -> Polytope:
     """The convex polygon with these corners, in two of the states, as a polytope over all of them.
 
     Proves: the polytope contains the polygon (``outward``: for what is to be avoided), or lies in it (for what is to be
-    stayed in or reached); between the two lie a few units of rounding.
+    stayed in or reached). The two are the same where floats hold the differences of corners, and what the sides' bounds
+    are computed to; between them lie a few units of rounding elsewhere.
 
     Parameters
     ----------
@@ -56,13 +57,29 @@ def polygon(vertices: ArrayLike, *, places: Sequence[int] = (0, 1), dimension: i
     normals, bounds, size = [], [], float(np.abs(points).max())
     for (x0, y0), (x1, y1) in zip(points, np.roll(points, -1, axis=0)):
         normal = np.array([y1 - y0, x0 - x1])
-        reach = float(max(normal @ [x0, y0], normal @ [x1, y1]))
-        slack = _SLACK * size * float(np.abs(normal).sum())
         row = np.zeros(dimension)
         row[list(places)] = normal
         normals.append(row)
-        bounds.append(reach + slack if outward else reach - slack)
+        bounds.append(_bound(normal, [(x0, y0), (x1, y1)], size, outward))
     return Polytope(np.array(normals), np.array(bounds))
+
+
+def _bound(normal: Array, ends: list[tuple[float, float]], size: float, outward: bool) -> float:
+    """The bound of a side between two corners, rounded to one side by no more than there is rounding in the normal."""
+    (x0, y0), (x1, y1) = corners = _exactly(np.array(ends))
+    along, across = map(Fraction, normal.tolist())
+    reach = max(along * x + across * y for x, y in corners)
+    if (along, across) == (y1 - y0, x0 - x1):
+        return _to_side(reach, outward)
+    slack = _SLACK * size * float(np.abs(normal).sum())
+    return float(reach) + slack if outward else float(reach) - slack
+
+
+def _to_side(value: Fraction, up: bool) -> float:
+    """The nearest float that is not below (``up``), or not above."""
+    found = float(value)
+    wrong = Fraction(found) < value if up else Fraction(found) > value
+    return float(np.nextafter(found, np.inf if up else -np.inf)) if wrong else found
 
 
 def _exactly(points: Array) -> list[tuple[Fraction, Fraction]]:
@@ -114,12 +131,12 @@ def intersection(parts: Sequence[Region], *, dimension: int, outward: bool) -> P
                 f"`all` must hold fixed boxes, halfspaces, polytopes and polygons here, and the {kind} {moves}; put a "
                 "polygon around it (or inside it, for what is to be stayed in or reached)."
             )
-        center = part.center_at()
-        shift = form.normals @ center
-        slack = _SLACK * (np.abs(form.normals) @ np.abs(center)) * (1.0 if outward else -1.0)
+        center = [Fraction(value) for value in part.center_at().tolist()]
         normals.append(part.lifted(form.normals, dimension))
-        bounds.append(np.where(shift == 0, form.bounds, form.bounds + shift + slack))
-    faces, ends = np.concatenate(normals), np.concatenate(bounds)
+        for row, bound in zip(form.normals.tolist(), form.bounds.tolist()):
+            moved = Fraction(bound) + sum(Fraction(entry) * place for entry, place in zip(row, center))
+            bounds.append(_to_side(moved, outward))
+    faces, ends = np.concatenate(normals), np.array(bounds)
     if linear_maximum(faces, ends, np.zeros(dimension)) is None:
         raise ValueError("`all` must hold sets with a point in common, and these have none.")
     return Polytope(faces, ends)
