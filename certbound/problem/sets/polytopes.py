@@ -14,15 +14,15 @@ from certbound.problem.sets.forms import Faces, Region, linear_maximum
 from certbound.problem.sets.regions import Polytope
 
 _SLACK = 2.0**-48
-"""Rounding of a side whose normal is rounded, in units of the numbers that it is computed from."""
+"""Rounding of a side that floats do not compute exactly, in units of the numbers that it is computed from."""
 
 
 def polygon(vertices: ArrayLike, *, places: Sequence[int] = (0, 1), dimension: int = 2, outward: bool) -> Polytope:
     """The convex polygon with these corners, in two of the states, as a polytope over all of them.
 
     Proves: the polytope contains the polygon (``outward``: for what is to be avoided), or lies in it (for what is to be
-    stayed in or reached). The two are the same where floats hold the differences of corners, and what the sides' bounds
-    are computed to; between them lie a few units of rounding elsewhere.
+    stayed in or reached). A side lies exactly where its corners put it where floats compute it without rounding;
+    elsewhere a few units of rounding lie between the two.
 
     Parameters
     ----------
@@ -65,21 +65,15 @@ def polygon(vertices: ArrayLike, *, places: Sequence[int] = (0, 1), dimension: i
 
 
 def _bound(normal: Array, ends: list[tuple[float, float]], size: float, outward: bool) -> float:
-    """The bound of a side between two corners, rounded to one side by no more than there is rounding in the normal."""
+    """The bound of a side between two corners: exact where floats compute it exactly, else moved to one side."""
     (x0, y0), (x1, y1) = corners = _exactly(np.array(ends))
     along, across = map(Fraction, normal.tolist())
-    reach = max(along * x + across * y for x, y in corners)
-    if (along, across) == (y1 - y0, x0 - x1):
-        return _to_side(reach, outward)
+    found = [float(normal @ np.array(end)) for end in ends]
+    held = (along, across) == (y1 - y0, x0 - x1)
+    if held and all(along * x + across * y == Fraction(value) for (x, y), value in zip(corners, found)):
+        return max(found)
     slack = _SLACK * size * float(np.abs(normal).sum())
-    return float(reach) + slack if outward else float(reach) - slack
-
-
-def _to_side(value: Fraction, up: bool) -> float:
-    """The nearest float that is not below (``up``), or not above."""
-    found = float(value)
-    wrong = Fraction(found) < value if up else Fraction(found) > value
-    return float(np.nextafter(found, np.inf if up else -np.inf)) if wrong else found
+    return max(found) + slack if outward else max(found) - slack
 
 
 def _exactly(points: Array) -> list[tuple[Fraction, Fraction]]:
@@ -131,12 +125,19 @@ def intersection(parts: Sequence[Region], *, dimension: int, outward: bool) -> P
                 f"`all` must hold fixed boxes, halfspaces, polytopes and polygons here, and the {kind} {moves}; put a "
                 "polygon around it (or inside it, for what is to be stayed in or reached)."
             )
-        center = [Fraction(value) for value in part.center_at().tolist()]
+        center = part.center_at()
+        moved = form.bounds + form.normals @ center
+        slack = _SLACK * (np.abs(form.normals) @ np.abs(center)) * (1.0 if outward else -1.0)
+        held = [_adds_up(*numbers, center) for numbers in zip(moved, form.bounds, form.normals)]
         normals.append(part.lifted(form.normals, dimension))
-        for row, bound in zip(form.normals.tolist(), form.bounds.tolist()):
-            moved = Fraction(bound) + sum(Fraction(entry) * place for entry, place in zip(row, center))
-            bounds.append(_to_side(moved, outward))
-    faces, ends = np.concatenate(normals), np.array(bounds)
+        bounds.append(np.where(held, moved, moved + slack))
+    faces, ends = np.concatenate(normals), np.concatenate(bounds)
     if linear_maximum(faces, ends, np.zeros(dimension)) is None:
         raise ValueError("`all` must hold sets with a point in common, and these have none.")
     return Polytope(faces, ends)
+
+
+def _adds_up(found: float, bound: float, normal: Array, center: Array) -> bool:
+    """Whether a float is bound + normal.center to the last digit."""
+    products = (Fraction(a) * Fraction(b) for a, b in zip(normal.tolist(), center.tolist()))
+    return Fraction(float(found)) == sum(products, Fraction(float(bound)))
