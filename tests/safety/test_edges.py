@@ -175,10 +175,9 @@ def domain_rows() -> Iterator[Row]:
     pushed = {"disturbance": Box([-1.0], [1.0])}
     still = cb.Rademacher(scale=[0.0])
     for shape in ("half-space", "box"):
-        safe = [Outside(FROM_ONE[shape])]
-        yield row(f"pushed avoid {shape}", steps_of(lambda x, d: d + 0 * x, still, [0.0], safe, 1, **pushed), 1, steps=0)
-        safe = [Inside(UP_TO_ONE[shape])]
-        yield row(f"pushed stay {shape}", steps_of(lambda x, d: d + 0 * x, still, [0.0], safe, 1, **pushed), 0, steps=0)
+        for word, constraint, truth in (("avoid", Outside(FROM_ONE[shape]), 1), ("stay", Inside(UP_TO_ONE[shape]), 0)):
+            problem = steps_of(lambda x, d: d + 0 * x, still, [0.0], [constraint], 1, **pushed)
+            yield row(f"pushed {word} {shape}", problem, truth, steps=0)
 
 
 # ---- a state without noise beside one with noise -------------------------------------------------------------
@@ -225,7 +224,8 @@ def line_rows(shapes: list[str]) -> Iterator[Row]:
         safe = [Inside(P_UP_TO_ONE[shape]), wide]
         one = steps_of(lambda x: [1 + 0 * x[0], 0.9 * x[1]], noise, [1.0, 0.0], safe, 2, **ALONG)
         yield row(f"line stay {shape}", one, 0, TINY)
-        yield row(f"line where stay {shape}", steps_of(jump(lambda q: q < 1), noise, [0.0, 0.0], safe, 2, **ALONG), 0, TINY)
+        there = steps_of(jump(lambda q: q < 1), noise, [0.0, 0.0], safe, 2, **ALONG)
+        yield row(f"line where stay {shape}", there, 0, TINY)
 
 
 def jump_rows() -> Iterator[Row]:
@@ -256,15 +256,14 @@ def full_rows() -> Iterator[Row]:
     """Noise on every state: only a start can lie on an edge."""
     wide = Inside(Box([-8.0, -8.0], [8.0, 8.0]))
     still = cb.GaussianStart([1.0, 0.0], [[0.0, 0.0], [0.0, 0.01]])
-    starts = {"point": [1.0, 0.0], "box": Box([0.0, 0.0], [1.0, 0.1]), "ball": cb.Ball([0.5, 0.0], 0.5), "random": still}
+    starts = {"point": [1.0, 0.0], "box": Box([0.0, 0.0], [1.0, 0.1]), "ball": cb.Ball([0.5, 0.0], 0.5)}
     noises = {"full": (cb.Gaussian(std=[0.1, 0.1]), {}), "line": (cb.Gaussian(std=[0.1]), ALONG)}
     for kind, (noise, more) in noises.items():
-        for name, start in starts.items():
+        for name, start in (starts | {"random": still}).items():
             for shape in ("half-space", "box", "ball of one state"):
-                for word, region, truth in (("avoid", P_FROM_ONE[shape], (1.0,)), ("stay", P_UP_TO_ONE[shape], (0, TINY))):
-                    if word == "stay" and shape == "ball of one state" and name == "random":
-                        continue
-                    safe = [(Outside if word == "avoid" else Inside)(region), wide]
+                both = (("avoid", Outside(P_FROM_ONE[shape]), (1,)), ("stay", Inside(P_UP_TO_ONE[shape]), (0, TINY)))
+                for word, constraint, truth in both:
+                    safe = [constraint, wide]
                     problem = steps_of(lambda x: [0 * x[0], 0.5 * x[1]], noise, start, safe, 2, **more)
                     drawn = None if name in ("point", "random") else 0
                     yield row(f"{kind} {name} {word} {shape}", problem, *truth, steps=drawn)
@@ -371,11 +370,10 @@ def one_of_each_kind() -> Iterator[Row]:
         "rademacher avoid half-space", "rademacher start avoid box", "rademacher stay ball", "uniform start avoid box",
         "corners stay polygon", "corners avoid ball", "reach ball during None then stay", "target and obstacle meet",
         "domain ends", "line avoid half-space", "line start avoid box with one side", "line stay half-space",
-        "floor avoid", "full random avoid half-space", "rest avoid box", "velocity stay", "vanishing start stay",
+        "floor avoid", "full random avoid half-space", "rest avoid box",
     }  # fmt: skip
     groups = [coin_rows(["rademacher"]), null_rows(), corner_rows(), target_rows(), domain_rows(), jump_rows(),
-              line_rows(["half-space", "box with one side"]), full_rows(), flow_rows(["rest"], ["box"]),
-              curved_rows(), vanishing_rows()]  # fmt: skip
+              line_rows(["half-space", "box with one side"]), full_rows(), flow_rows(["rest"], ["box"])]  # fmt: skip
     found = [one for group in groups for one in group if one.name in wanted]
     assert {one.name for one in found} == wanted
     return iter(found)

@@ -22,7 +22,7 @@ class Inside:
     Parameters
     ----------
     region : Box, Ball, Ellipsoid, HalfSpace, Polytope or another Region
-        Closed set.
+        Closed set: a state on its boundary is in it, safe where it is to be stayed in, failed where it is an obstacle.
     during : (float, float), optional
         First and last time (step) at which the constraint holds; the whole horizon when omitted, and (T, T)
         makes it a terminal one.
