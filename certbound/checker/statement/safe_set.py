@@ -52,6 +52,11 @@ class _Shape:
         high = self.over(centre, radius)[1]
         return bool(high < 0 or (high <= 0 and not (self.outside and (strictly or self._thin()))))
 
+    def breaks(self, centre: Sequence[arb], radius: Sequence[arb]) -> bool:
+        """Whether every point of a box breaks it: regions are closed, so that a point on an obstacle's edge does."""
+        low = self.over(centre, radius)[0]
+        return bool(low > 0 or (self.outside and low >= 0))
+
     def _thin(self) -> bool:
         """Whether the region was not shown to have an interior, as a ball, a half-space and a box of a volume have."""
         if self.bound is not None:
@@ -128,7 +133,7 @@ class StepSet:
         """Whether every point of a box breaks a constraint, the same one."""
         centre = [(a + b) / 2 for a, b in box]
         radius = [(b - a) / 2 for a, b in box]
-        return any(shape.over(centre, radius)[0] > 0 for shape in self._shapes)
+        return any(shape.breaks(centre, radius) for shape in self._shapes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
