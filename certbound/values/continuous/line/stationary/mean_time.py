@@ -33,7 +33,7 @@ from certbound.values.continuous.coefficients import enclose, squared_diffusion
 from certbound.values.exact import interval_of
 from certbound.watch import poll
 
-_FIRST, _MOST = 256, 50_000  # cells at first, and at most
+_FIRST, _MOST = 256, 100_000  # cells at first, and at most
 _GOOD = 3e-4  # of L m, by which it may miss -1 in a cell that is not halved
 _HALVINGS, _IDLE = 24, 3  # rounds at most, and those without a gain, as rounding is in the way
 _WORST = 0.5  # of L m, by which it may miss -1 at all
