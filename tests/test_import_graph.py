@@ -75,7 +75,7 @@ safety.certificates
 safety.portfolio
 safety.certificate
 safety.verdict
-safety.members safety.misses safety.averages
+safety.members safety.misses safety.averages safety.search
 safety.decision
 safety
 safety.sweeps

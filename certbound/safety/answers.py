@@ -110,6 +110,8 @@ class EngineAnswer:
         Whether no other engine can do much better: slow refinements of others may be left out.
     truncated : bool
         Whether an ellipsoid of starts stands for a random start, whose other values count as failing.
+    effort : float or None
+        The effort that was spent (`Request`), where the engine plans its work; None: what was asked for.
     hoped : float or None
         About log10 of the lower bound that a request from ``below`` would lead to; none was looked for.
     """
@@ -134,6 +136,7 @@ class EngineAnswer:
     details: Any = None
     conclusive: bool = False
     truncated: bool = False
+    effort: float | None = None
     hoped: float | None = None
 
 
@@ -146,7 +149,9 @@ class Request:
     what is slow and then seldom decides may be left out. Not ``thorough``: an engine may spare itself, as it is asked
     again where that matters, with the ``details`` of its first answer as ``before``. ``bounded``: some probability
     below 1 is proved, and what has no hope of delta may be left out. ``first``: it may end with the first bound that it
-    finds, and goes on from there when it is asked again. ``at_length``: all the time that is left is its own.
+    finds, and goes on from there when it is asked again. ``effort``: the work that it is asked for, as a multiple of
+    what it does where it is asked alone; its pace is known then, so that it plans for just that. None: as much of 1 as
+    the engine itself takes to fit into the time.
     ``below``: a lower bound is all that is wanted, where that is less work; ``above``: an upper one.
     ``found`` takes an answer that holds already while the engine looks for a better one: it stands where time ends the
     search (`certbound.watch`).
@@ -159,11 +164,16 @@ class Request:
     thorough: bool = True
     first: bool = False
     bounded: bool = False
-    at_length: bool = False
+    effort: float | None = None
     below: bool = False
     above: bool = False
     before: Any = None
     found: Callable[[EngineAnswer], object] = lambda answer: None
+
+    @property
+    def at_length(self) -> bool:
+        """Whether more is asked for than an engine does by itself."""
+        return self.effort is not None and self.effort > 1
 
 
 SPARED = "not asked, since another engine had answered."
@@ -216,7 +226,7 @@ def is_more_than(log10_lower: float, target: float) -> bool:
 
 def may_decide(answer: EngineAnswer, target: float) -> bool:
     """Whether an engine's bounds are near each other with the target in between, so that more time may decide."""
-    if not answer.applicable or answer.conclusive or answer.log10_lower is None:
+    if not answer.applicable or answer.log10_lower is None:
         return False
     return answer.log10_lower <= math.log10(target) < answer.log10_delta <= answer.log10_lower + _NEAR
 

@@ -1,8 +1,9 @@
 """The search for a verdict: which engine is asked when, and what is kept once the time is over.
 
 Sketches come first, since they cost next to nothing; then the engines in turn, until one has proved SAFE, those that
-have hardly a chance last; then those that spared themselves. Under a limit of time an engine that takes long is
-interrupted, early for first bounds, later for all others, and goes on with what they leave: none starves.
+have hardly a chance last. Where nothing is decided then, `certbound.safety.search` says who is asked with how much
+effort. Under a limit of time an engine that takes long is interrupted, early for first bounds, later for all others,
+and goes on with what they leave: none starves.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ from typing import Any
 from certbound.errors import EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
-from certbound.safety.answers import EngineAnswer, Request, is_more_than, may_decide, with_lower
+from certbound.safety.answers import SPARED, EngineAnswer, Request, is_more_than, may_decide, with_lower
 from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import arrival, best_time, find_miss, window_of
 from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of, in_order
-from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, undone, unsafe, verdict_of
+from certbound.safety.search import Action, Standing, Turn, next_action
+from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, undone, unfinished, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch
 
@@ -49,11 +51,12 @@ _EXTRA = 0.2  # of the time that is left, for a bound that can no longer change 
 
 def decide(
     problem: Problem, *, method: str = "auto", cells: int | None = None, constants: Constants | None = None,
-    watch: Watch | None = None,
+    watch: Watch | None = None, full: bool = True,
 ) -> Verdict:
     """The verdict that the engines find in the time that a watch leaves; see `verify_safety` for the arguments.
 
-    Without a watch the one that runs already, if any, ends the search.
+    Without a watch the one that runs already, if any, ends the search. Without ``full``, for one of many problems, an
+    engine that left something out is asked again only where that may decide, and never for more.
     """
     if not isinstance(method, str):
         raise TypeError(f"`method` must be the name of one, got {method!r}; leave it out for the best of all engines.")
@@ -65,20 +68,21 @@ def decide(
         check_request(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
     options: dict[str, Any] = {"method": method, "cells": cells, "constants": constants, "watch": watch}
     if len(problem.starts) > 1:
-        return worst_verdict(problem, watch, lambda member: decide(member, **options))
+        return worst_verdict(problem, watch, lambda member: decide(member, full=full, **options))
     if problem.random:
-        return average_verdict(problem, watch, lambda cell: decide(cell, **options))
-    search = _Search(problem, request, watch)
+        return average_verdict(problem, watch, lambda cell: decide(cell, full=False, **options))
+    search = _Search(problem, request, watch, full=full)
     try:
         with search.watch.running():
             violation = search.violation()
             if violation is not None and not search.arrives_by_noise(names):
                 return unsafe(problem, violation, method)
             if method == "auto":
-                search.whole(names)
+                search.first_pass(names)
             else:
                 search.ask(names[0], request)
                 search.below(names)
+            search.go_on(names, patient=full and watch.patient and watch.limit is not None)
     except OutOfTime:
         _log.info("the search ended with its time")
     return search.verdict(names)
@@ -87,14 +91,15 @@ def decide(
 class _Search:
     """One problem, one watch, and what each engine has answered so far."""
 
-    def __init__(self, problem: Problem, request: Request, watch: Watch) -> None:
-        self.problem, self.request, self.watch = problem, request, watch
+    def __init__(self, problem: Problem, request: Request, watch: Watch, *, full: bool = True) -> None:
+        self.problem, self.request, self.watch, self.full = problem, request, watch, full
         self.answers: dict[str, EngineAnswer] = {}
         self.left_at: dict[str, str] = {}
         self.sketches: dict[str, EngineAnswer] = {}
         self.chances: dict[Any, float] = {}
         self.spent: dict[str, float] = {}
-        self.full: set[str] = set(ENGINES if request.thorough else ())
+        self.turns: dict[str, list[Turn]] = {}
+        self.ended: set[str] = set()  # who came to the end of a request that left nothing out for others' sake
         self._inner = 0.0  # seconds of engines that had a turn inside another one's
 
     @property
@@ -143,8 +148,8 @@ class _Search:
                 self.ask(name, self.request)
         return self.safe
 
-    def whole(self, names: tuple[str, ...]) -> None:
-        """Sketches, all engines in turn, and thoroughly those that spared themselves."""
+    def first_pass(self, names: tuple[str, ...]) -> None:
+        """Sketches, and all engines in turn."""
         if self.endlessly(names):
             return
         if self.problem.system.dimension <= _LARGE and self.request.constants is None:
@@ -156,16 +161,52 @@ class _Search:
         both = sorted(names, key=lambda name: self.refuted and ENGINES[name].write_below is None)  # from both sides
         with self.watch.share(1.0, _ANYWAY[self.problem.system.dimension <= _FEW] if self.refuted else math.inf):
             self._in_turn(tuple(both))
-        if self.safe or self.refuted or self.request.cells is not None:
-            return
-        if self._in_full(names, 1 - _LAST) or (self._refining(names) and self._at_length(names)):
-            return
-        for name in (name for name in names if ENGINES[name].again and (self._likely(name) or not self.bounded)):
-            first = self.answers.get(name)
-            if first is not None and first.applicable and not first.conclusive:
-                self._thoroughly(name, Request(before=first.details))
-        if not self.safe and not self._at_length(names):
-            self._at_last(names)
+
+    def go_on(self, names: tuple[str, ...], *, patient: bool) -> None:
+        """Ask one engine after the other with as much effort as may still decide, until nothing is left to be asked."""
+        while not (self.safe or self.refuted):
+            action = next_action(self.standings(names, patient=patient), self.watch.left, patient=patient)
+            if action is None:
+                return
+            self._do(action)
+
+    def _do(self, action: Action) -> None:
+        """One more request; where nobody set a limit, only as long as is in proportion to what it all took so far."""
+        most = max(_THOROUGH, _LONGER * self.watch.spent) if self.watch.limit is None else math.inf
+        first = None if self.request.cells is not None else self.answers.get(action.engine)
+        request = replace(self.request, thorough=True, effort=action.effort, before=first and first.details)
+        with self.watch.share(1.0, min(action.seconds, most)):
+            self.ask(action.engine, request)
+
+    def standings(self, names: tuple[str, ...], *, patient: bool) -> list[Standing]:
+        """What each engine has done so far, in their order."""
+        return [
+            Standing(
+                name=name, applicable=name not in self.answers or self.answers[name].applicable,
+                waits=self._waits(name, patient=patient), refines=ENGINES[name].refines, last=ENGINES[name].again,
+                near=name in self.answers and may_decide(self.answers[name], self.problem.delta),
+                log10_delta=self.answers[name].log10_delta if name in self.answers else 0.0,
+                turns=tuple(self.turns.get(name, ())),
+            )
+            for name in names
+        ]  # fmt: skip
+
+    def _waits(self, name: str, *, patient: bool) -> bool:
+        """Whether an engine left something out that is worth being asked for."""
+        row, answer, few = ENGINES[name], self.answers.get(name), self.problem.system.dimension < _FEW
+        if any(turn.ended and turn.effort >= 1 for turn in self.turns.get(name, ())):
+            return False
+        spared = self.problem.system.dimension < row.spares
+        refused = answer is not None and not answer.applicable and answer.reason != SPARED and name in self.ended
+        if (refused and not spared) or not (spared or row.again or row.refines or name not in self.ended):
+            return False
+        if patient or answer is None:
+            return patient or not (self.bounded or self.settled)
+        if may_decide(answer, self.problem.delta):
+            return True
+        if self.settled or (self.bounded and not self._likely(name)):
+            return False
+        return self.full or (few and not self.bounded) or (row.again and answer.applicable)
 
     def below(self, names: tuple[str, ...]) -> None:
         """Ask for lower bounds that take little."""
@@ -177,32 +218,6 @@ class _Search:
                     found = self._without(found)
                     self.answers[name] = with_lower(self.answers.get(name, found), found)
                     self.watch.noted(0.0, found.log10_lower)
-
-    def _refining(self, names: tuple[str, ...]) -> bool:
-        """Whether the smallest bound is that of an engine whose bound falls with the time that it is granted."""
-        found = [name for name in names if name in self.answers]
-        best = min(found, key=lambda name: self.answers[name].log10_delta, default=None)
-        return best is not None and ENGINES[best].refines and self.bounded
-
-    def _at_length(self, names: tuple[str, ...]) -> bool:
-        """Where somebody waits for a limit of his own: engines that refine go on, the nearest first; whether SAFE."""
-        at_length = self.watch.patient and self.watch.limit is not None
-        found = [name for name in names if name in self.answers and at_length]
-        for name in sorted(found, key=lambda name: self.answers[name].log10_delta):
-            first = self.answers[name]
-            if not (ENGINES[name].refines and first.applicable) or first.conclusive or self.safe:
-                continue
-            if first.log10_lower is None or not is_more_than(first.log10_lower, self.problem.delta):
-                with self.watch.share(1 - _LAST):
-                    self.ask(name, Request(before=first.details, at_length=True))
-        return self.safe
-
-    def _at_last(self, names: tuple[str, ...]) -> None:
-        """Where nobody proved anything of few states, ask thoroughly whose bound falls with the time granted."""
-        for name in (name for name in names if ENGINES[name].refines and name not in self.full):
-            few = self.problem.system.dimension < _FEW and not self.bounded and not self.refuted
-            if few and name in self.answers and self.answers[name].applicable and not self.answers[name].conclusive:
-                self._thoroughly(name, Request(before=self.answers[name].details))
 
     def endlessly(self, names: tuple[str, ...]) -> bool:
         """Whether a function of one state settles a target without an end, which others meet at some late time.
@@ -216,22 +231,6 @@ class _Search:
                 self.ask(name, self.request)
         return asked and self.settled
 
-    def _in_full(self, names: tuple[str, ...], share: float) -> bool:
-        """Ask once those that spared themselves where nobody proved anything, or may decide now; whether one did."""
-        with self.watch.share(share):
-            for name in (name for name in names if name in self.answers and name not in self.full):
-                few = self.problem.system.dimension < ENGINES[name].spares
-                if (few and not self.bounded) or may_decide(self.answers[name], self.problem.delta):
-                    self.full.add(name)
-                    self._thoroughly(name, Request())
-        return self.safe or self.refuted
-
-    def _thoroughly(self, name: str, request: Request) -> None:
-        """Ask once more; where nobody set a limit, only as long as that is in proportion to what it all took so far."""
-        most = max(_THOROUGH, _LONGER * self.watch.spent) if self.watch.limit is None else math.inf
-        with self.watch.share(1.0, most):
-            self.ask(name, request)
-
     def _in_turn(self, names: tuple[str, ...]) -> None:
         """Ask one engine after the other; one that takes long is interrupted for those after it."""
         if not names:
@@ -244,7 +243,8 @@ class _Search:
             turn.append(True)
             with self.watch.share(_LAST if surely else share):
                 self._in_turn(names[1:])
-            self._in_full(names[1:], share)
+            with self.watch.share(share):
+                self.go_on(names[1:], patient=False)
             if self.safe:
                 raise OutOfTime
 
@@ -314,15 +314,32 @@ class _Search:
             if answer.applicable and answer.certified:
                 self.watch.noted(answer.log10_delta, answer.log10_lower)
 
+        begun = self.watch.spent
         try:
             answer = self._asked(name, replace(request, found=found))
         except OutOfTime:
             self.left_at[name] = self.watch.phase
             self.answers.setdefault(name, stopped(name, self.watch.phase))
+            self._note(name, request, self.watch.spent - begun, None)
             raise
         self.left_at.pop(name, None)
-        if answer.applicable or name not in self.answers:
+        if answer.applicable or name not in self.answers or not self.answers[name].applicable:
             found(answer)
+        self._note(name, request, self.watch.spent - begun, answer)
+
+    def _note(self, name: str, request: Request, seconds: float, answer: EngineAnswer | None) -> None:
+        """Keep what a request took, and with which effort the engine came to its end (None: it did not)."""
+        if request.quick or request.first:
+            return
+        if answer is not None:
+            self.ended.add(name)
+        spent = None if answer is None else answer.effort
+        if request.thorough or spent is not None:
+            known, effort = self.answers[name], request.effort if spent is None else spent
+            lower = -math.inf if known.log10_lower is None else known.log10_lower
+            turn = Turn(effort=1.0 if effort is None else effort, seconds=seconds, ended=answer is not None,
+                        log10_delta=known.log10_delta, log10_lower=lower)  # fmt: skip
+            self.turns.setdefault(name, []).append(turn)
 
     def _asked(self, name: str, request: Request) -> EngineAnswer:
         """What an engine answers; where it fails, that it does not apply, and why. ``spent`` counts the seconds."""
@@ -410,6 +427,12 @@ class _Search:
         answers = {name: self.answers[name] for name in ENGINES if name in self.answers}
         found = verdict_of(self.problem, answers, names[0] if len(names) == 1 else "auto")
         seconds = MappingProxyType({name: self.spent.get(name, 0.0) for name in answers})
-        over = self.watch.limit is not None and self.watch.left <= 0 and found.status == "UNKNOWN"
-        left = f" {undone(self.watch, self.answers, self.left_at, names)}" if over else ""
-        return replace(found, seconds=seconds, reason=f"{found.reason}{left}".strip())
+        if found.status == "UNKNOWN":
+            found = replace(found, reason=f"{found.reason} {self._end(names)}".strip())
+        return replace(found, seconds=seconds)
+
+    def _end(self, names: tuple[str, ...]) -> str:
+        """Why the search ended with nothing decided."""
+        if self.watch.limit is not None and self.watch.left <= 0:
+            return undone(self.watch, self.answers, self.left_at, names)
+        return unfinished([one.name for one in self.standings(names, patient=True) if not one.exhausted])

@@ -29,12 +29,13 @@ from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart
 from certbound.values.continuous import bound_mean_time, chart_slabs_of
 from certbound.values.discrete import chart_failures
-from certbound.watch import OutOfTime, poll, seconds_left
+from certbound.watch import OutOfTime, poll, share_of_time
 
 _STEP = 0.004  # of log P, between two times at which a curve is read
 _FEWER = {1.0: 1.4, 0.05: 1.27}  # ratio of a horizon to the next shorter one, where P is at most so much
 _SHORTEST = 40  # horizons
 _RARE = -6.0  # log10 of a probability below which no shorter horizon is looked at
+_HALF = 0.5  # of the time that is left, at most, for the mean by one function
 _SHARE = 0.004  # cells of discrete time, as `FailureBounds` has them
 
 
@@ -115,7 +116,8 @@ def _ends_text(low: float, high: float) -> tuple[str, str]:
 def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> ExitTimes:
     """Bound P(exit before s) for every s <= T from above and below, and the mean time of leaving.
 
-    Long horizons come first: once a limit of time is over, what was proved of them stands for all times.
+    The mean comes first, and long horizons before short ones: once a limit of time is over, what was proved of them
+    stands for all times.
 
     Parameters
     ----------
@@ -150,15 +152,20 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
     """
     instance("problem", problem, Problem)
     _check(problem)
+    mean = _mean_by_function(problem)  # before the curves, which may take all of the time
     try:
         with contained("values"):
             upper, lower, share = (_continuous if isinstance(problem.system, ContinuousSystem) else _discrete)(problem)
     except EngineError as error:
         raise InfeasibleError(f"exit times could not be bounded: {error}") from error
-    grid = np.unique([s for s, *_ in (*upper, *lower)] + [0.0])
+    except OutOfTime:
+        if mean is None:
+            raise
+        upper, lower, share = [], [], 0.0
+    grid = np.unique([s for s, *_ in (*upper, *lower)] + [0.0, float(problem.horizon)])
     above = _above(upper, grid)
     below, least = (_below(lower, grid, k) for k in (1, 2))
-    mean_lower, mean_upper = _sharper(problem, *_means(problem, grid, above, least, share))
+    mean_lower, mean_upper = _sharper(mean, *_means(problem, grid, above, least, share))
     found = ExitTimes(
         problem=problem, times=grid, lower=below, upper=above, mean_lower=mean_lower, mean_upper=mean_upper
     )
@@ -281,13 +288,20 @@ def _below(curve: Curve, grid: Array, place: int) -> Array:
     return found
 
 
-def _sharper(problem: Problem, low: float, high: float | None) -> tuple[float, float | None]:
-    """The better of these bounds of the mean and of those by one function of the state, where that proves anything."""
+def _mean_by_function(problem: Problem) -> tuple[float, float | None] | None:
+    """Bounds of the mean by one function of the state; None where it proves nothing."""
     try:
-        with contained("mean time"):
-            found = bound_mean_time(problem) if seconds_left() > 0 else None
-    except (EngineError, OutOfTime):
-        found = None
+        with contained("mean time"), share_of_time(_HALF):
+            return bound_mean_time(problem)
+    except EngineError:
+        pass
+    return None
+
+
+def _sharper(
+    found: tuple[float, float | None] | None, low: float, high: float | None
+) -> tuple[float, float | None]:
+    """The better of these bounds of the mean and of those by one function."""
     if found is None:
         return low, high
     return max(low, found[0]), min((end for end in (high, found[1]) if end is not None), default=None)

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 from certbound.problem.problem import Problem
 from certbound.safety.verdict import Verdict
-from certbound.watch import Watch
+from certbound.watch import OutOfTime, Watch
+
+_LONGER = 1.5  # times its share of the time, without which no member is asked again
 
 
 def worst_verdict(problem: Problem, watch: Watch, decided: Callable[[Problem], Verdict]) -> Verdict:
@@ -15,17 +17,31 @@ def worst_verdict(problem: Problem, watch: Watch, decided: Callable[[Problem], V
 
     The probability from the worst start of a union is that from the worst start of a member, so that the largest of
     the members' bounds is one, and so is the largest of their lower bounds. Each member has an equal share of the time
-    that is left; a noise-free trajectory that leaves ends the search.
+    that is left; a noise-free trajectory that leaves ends the search. Where somebody waits for a limit, what is left
+    of it then goes to members that are undecided.
     """
-    found: list[Verdict] = []
+    found, shares, members = list[Verdict](), list[float](), list(_members(problem))
     with watch.running():
-        for share, member in _members(problem):
-            watch.log10_delta, watch.log10_lower = 0.0, None  # what is told is about this member
-            with watch.share(share):
-                found.append(decided(member))
+        for share, member in members:
+            shares.append(share * watch.left)
+            found.append(_asked(member, watch, share, decided))
             if found[-1].status == "UNSAFE_NOMINAL":
                 break
+        refuted = any(verdict.status.startswith("UNSAFE") for verdict in found)
+        if watch.patient and watch.limit is not None and not refuted:
+            for number, (_, member) in enumerate(members):
+                if found[number].status == "UNKNOWN" and watch.left > _LONGER * shares[number]:
+                    again = _asked(member, watch, 1.0, decided)
+                    found[number] = min(found[number], again, key=lambda verdict: verdict.log10_delta)
     return _worst(problem, found)
+
+
+def _asked(member: Problem, watch: Watch, share: float, decided: Callable[[Problem], Verdict]) -> Verdict:
+    """The verdict on one member within a share of the time that is left."""
+    watch.log10_delta, watch.log10_lower = 0.0, None  # what is told is about this member
+    with watch.share(share):
+        return decided(member)
+    raise OutOfTime
 
 
 def _members(problem: Problem) -> Iterator[tuple[float, Problem]]:

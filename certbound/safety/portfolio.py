@@ -65,10 +65,11 @@ class Engine:
     reserve : bool
         Asked while nothing else has proved SAFE, and for the smallest probability, as its bound knows no delta.
     again : bool
-        Asked a second time, thoroughly, where nothing was proved SAFE.
+        Where it is not asked thoroughly it leaves something out: it is asked a second time where nothing was proved
+        SAFE, after the others of that kind.
     refines : bool
-        Its bound falls with the time that it is granted: it goes on where nothing is SAFE and somebody waits for a
-        limit of his own.
+        The same; and its bound falls with the effort that a request names, so that it is asked for more and more where
+        nothing is SAFE and a limit of time was given.
     sketch : bool
         Asked before all others, quickly: that takes next to nothing.
     dear : bool
@@ -148,6 +149,7 @@ ENGINES: dict[str, Engine] = {
             prove=by_logarithms(barrier_engine),
             write=of_coordinates(barrier_proof),
             reserve=True,
+            refines=True,
             chance=_polynomials,
         ),
         Engine(

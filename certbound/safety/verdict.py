@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -289,6 +289,13 @@ def undone(watch: Watch, answered: Collection[str], left_at: Mapping[str, str], 
     rest += [name for name in names if name not in answered]
     more = f" More time would go on with {', then '.join(rest)}." if rest else ""
     return f"The search was stopped after {watch.limit:g} s.{more}"
+
+
+def unfinished(names: Sequence[str]) -> str:
+    """What a search that ended before its time would go on with, or that nothing is left to be tried."""
+    if not names:
+        return "Nothing more can be tried: no engine proves more with more effort."
+    return f"A time limit of your own lets {', '.join(names)} go on."
 
 
 def _bounded(answer: EngineAnswer) -> str:

@@ -60,7 +60,7 @@ def _asked(problem: cb.Problem, seconds: float) -> cb.Verdict | EngineAnswer:
     if found.status != "UNSAFE_NOMINAL":
         return found
     with Watch(seconds).running():
-        return values_engine(problem, Request(at_length=True))
+        return values_engine(problem, Request(effort=max(seconds / 20, 1.0)))
 
 
 def check(seed: int, seconds: float) -> tuple[str, float, float, str]:

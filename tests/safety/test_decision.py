@@ -54,7 +54,7 @@ def problem() -> cb.Problem:
 
 
 def scripted(monkeypatch: pytest.MonkeyPatch, clock: Time, scripts: dict[str, Steps], **flags: Any) -> list[str]:
-    """Engines that work and prove as they are told; what was asked, in order."""
+    """Engines that work and prove as they are told, and leave nothing out for later; what was asked, in order."""
     asked: list[str] = []
 
     def row(name: str, steps: Steps) -> Any:
@@ -68,6 +68,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch, clock: Time, scripts: dict[str, St
             return best
 
         plain = {"sketch": False, "again": False, "reserve": False, "soon": 0, "chance": None}
+        plain |= {"refines": False, "spares": 0}
         return replace(ENGINES[name], prove=prove, **plain | flags)
 
     for name in ENGINES:
@@ -195,17 +196,15 @@ def test_an_engine_without_a_chance_has_all_the_time_where_nothing_else_proves_a
     assert seconds == pytest.approx(100, abs=1)
 
 
-def test_who_spares_itself_is_asked_in_full_where_nothing_is_proved(
-    monkeypatch: pytest.MonkeyPatch, clock: Time
+@pytest.mark.parametrize(("other", "full", "count"), [(0, True, 2), (-1, True, 2), (0, False, 2), (-1, False, 1)])
+def test_who_spares_itself_is_asked_in_full_where_nothing_is_decided(
+    monkeypatch: pytest.MonkeyPatch, clock: Time, other: float, full: bool, count: int
 ) -> None:
-    asked = scripted(monkeypatch, clock, {"quadratic": [(1, 0)]})
+    """Of one problem always, or it would be proved less than by naming the engine; of many where nothing is proved."""
+    asked = scripted(monkeypatch, clock, {"quadratic": [(1, 0)], "linear": [(1, other)]})
     monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], spares=2))
-    run(clock, None)
-    assert asked.count("quadratic") == 2
-    asked = scripted(monkeypatch, clock, {"quadratic": [(1, 0)], "linear": [(1, -1)]})
-    monkeypatch.setitem(ENGINES, "quadratic", replace(ENGINES["quadratic"], spares=2))
-    run(clock, None)
-    assert asked.count("quadratic") == 1
+    decide(problem(), watch=Watch(None, clock=clock), full=full)
+    assert asked.count("quadratic") == count
 
 
 def test_what_takes_no_grids_is_asked_before_what_does(monkeypatch: pytest.MonkeyPatch, clock: Time) -> None:
@@ -234,9 +233,9 @@ def test_once_unsafe_is_proved_nobody_is_asked_in_full(monkeypatch: pytest.Monke
     assert [asked.count(name) for name in ("linear", "quadratic")] == [1, 1]
 
 
-@pytest.mark.parametrize(("lower", "count"), [(-3.2, 2), (-3.5, 1)])
+@pytest.mark.parametrize(("lower", "full", "count"), [(-3.2, False, 2), (-3.5, False, 1), (-3.5, True, 2)])
 def test_bounds_that_are_near_what_is_asked_are_made_better(
-    monkeypatch: pytest.MonkeyPatch, clock: Time, lower: float, count: int
+    monkeypatch: pytest.MonkeyPatch, clock: Time, lower: float, full: bool, count: int
 ) -> None:
     asked = scripted(monkeypatch, clock, {})
 
@@ -244,8 +243,8 @@ def test_bounds_that_are_near_what_is_asked_are_made_better(
         asked.append("near")
         return EngineAnswer(method="values", log10_delta=-2.8, log10_lower=-2.9 if request.thorough else lower)
 
-    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=near))
-    verdict, _ = run(clock, 60)
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=near, refines=True))
+    verdict = decide(problem(), watch=Watch(60, clock=clock), full=full)
     assert asked.count("near") == count
     assert verdict.status == ("UNSAFE" if count == 2 else "UNKNOWN")
 
@@ -421,16 +420,16 @@ def test_what_is_left_of_a_limit_of_ones_own_goes_to_who_refines(
         clock.work(5 if request.at_length else 1, "refining")
         return EngineAnswer(method="values", log10_delta=-4 if request.at_length else -2)
 
-    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine))
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine, refines=True))
     verdict = decide(problem(), watch=Watch(30, clock=clock, patient=patient))
     assert verdict.status == ("SAFE" if patient else "UNKNOWN")
     assert len(asked) == patient  # quadratic, which was farther off, has no need to go on
     assert all(20 < left < 27 for left in asked)
 
 
-@pytest.mark.parametrize("other", [0.0, -1.0])
-def test_where_nobody_proved_anything_who_refines_is_asked_thoroughly_at_last(
-    monkeypatch: pytest.MonkeyPatch, clock: Time, other: float
+@pytest.mark.parametrize(("other", "full"), [(0.0, True), (-1.0, True), (0.0, False), (-1.0, False)])
+def test_where_nothing_is_decided_who_refines_is_asked_thoroughly_at_last(
+    monkeypatch: pytest.MonkeyPatch, clock: Time, other: float, full: bool
 ) -> None:
     """An epidemic in persons was UNKNOWN with 1 after 20 of 60 s; more of a grant than the first 5 s proved SAFE."""
     scripted(monkeypatch, clock, {"linear": [(1, other)]})
@@ -439,9 +438,9 @@ def test_where_nobody_proved_anything_who_refines_is_asked_thoroughly_at_last(
         clock.work(1, "refining")
         return EngineAnswer(method="values", log10_delta=-4.0 if request.thorough else 0.0)
 
-    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine))
-    verdict = decide(problem(), watch=Watch(60, clock=clock, patient=False))
-    assert verdict.status == ("SAFE" if other == 0 else "UNKNOWN")
+    monkeypatch.setitem(ENGINES, "values", replace(ENGINES["values"], prove=refine, refines=True))
+    verdict = decide(problem(), watch=Watch(60, clock=clock, patient=False), full=full)
+    assert verdict.status == ("SAFE" if full or other == 0 else "UNKNOWN")
 
 
 @pytest.mark.parametrize(("horizon", "first"), [(2000, "values"), (900, "linear")])

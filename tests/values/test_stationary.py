@@ -9,7 +9,7 @@ import pytest
 from numpy.polynomial import Chebyshev
 
 import certbound as cb
-from certbound.values.continuous.line import stationary
+from certbound.values.continuous.line.stationary import leaving_rate, mean_time
 
 
 def exactly(coefficients: list[Fraction], y: float) -> Fraction:
@@ -31,9 +31,10 @@ def test_sums_lie_within_their_error_of_the_exact_ones(kind: str) -> None:
         values[0] -= values.sum()
     scale = 1e-310 if kind == "tiny" else 1.0
     given = [Fraction(value * scale) / 3 for value in values.tolist()]
-    for coefficients in (given, stationary._derivative(given), stationary._derivative(stationary._derivative(given))):
+    once = leaving_rate._derivative(given)
+    for coefficients in (given, once, leaving_rate._derivative(once)):
         y = np.concatenate([np.arange(-7, 8, 2) / 8, [1 - 2.0**-14, -1 + 2.0**-14]])
-        found, error = stationary._summed(coefficients, y)
+        found, error = leaving_rate._summed(coefficients, y)
         exact = [exactly(coefficients, place) for place in y.tolist()]
         assert all(abs(Fraction(a) - b) <= Fraction(e) for a, b, e in zip(found.tolist(), exact, error.tolist()))
         assert np.all(error <= 1e-12 * float(sum(map(abs, coefficients))) + 1e-300)
@@ -41,9 +42,9 @@ def test_sums_lie_within_their_error_of_the_exact_ones(kind: str) -> None:
 
 def test_derivatives_are_the_exact_ones() -> None:
     given = [Fraction(k, 7) for k in (3, -2, 5, 1, -4)]
-    once, h = stationary._derivative(given), Fraction(1, 10**6)
+    once, h = leaving_rate._derivative(given), Fraction(1, 10**6)
     assert len(once) == 4
-    assert stationary._derivative(given[:1]) == [0]
+    assert leaving_rate._derivative(given[:1]) == [0]
     for y in (-0.75, 0.0, 0.5):
         middle = (exactly(given, y + float(h)) - exactly(given, y - float(h))) / (
             Fraction(y + float(h)) - Fraction(y - float(h))
@@ -59,9 +60,9 @@ def test_ranges_over_cells_hold_between_the_middles() -> None:
         safe=[cb.Inside(cb.Box([-2], [1]))],
         horizon=1,
     )
-    square = stationary._square(problem)
+    square = mean_time.squared_of(problem)
     assert square is not None
-    cells = stationary._Cells(problem, square, -2.0, 1.0, 32)
+    cells = leaving_rate._Cells(problem, square, -2.0, 1.0, 32)
     m = Chebyshev(np.random.default_rng(4).standard_normal(13), domain=[-2, 1])
     x = -2 + 3 * (np.arange(32)[:, None] + np.linspace(0, 1, 21)) / 32
     for found, exact in (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from certbound.cli.clock import Clock, TimeLimitOption
+from certbound.cli.clock import Clock, VerdictLimitOption
 from certbound.cli.options import (
     HorizonOption,
     JsonOption,
@@ -20,6 +20,7 @@ from certbound.cli.options import (
 )
 from certbound.cli.output import SETTINGS, console, show, spinner
 from certbound.cli.pictures import check_picture, write_picture
+from certbound.cli.progress import progress
 from certbound.display import name_text
 
 if TYPE_CHECKING:
@@ -30,24 +31,27 @@ EXAMPLES = examples(
     "certbound exit-times my_system.toml --plot exits.png",
 )
 
+DEFAULT_LIMIT = 60.0
+
 
 def exit_times(
     problem: ProblemArgument,
     pairs: SetOption = None,
     horizon: HorizonOption = None,
     plot: PlotOption = None,
-    time_limit: TimeLimitOption = None,
+    time_limit: VerdictLimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Bound the probability of leaving before every time up to the horizon, and the mean time (one state)."""
     check_writable(plot, problem=problem)
     check_picture(plot)
     subject = load_problem(problem, pairs, horizon=horizon)
-    started = time.perf_counter()
-    with Clock(time_limit).running(), spinner(f"bounding the exit times of {name_text(subject.name)}"):
+    started, limit = time.perf_counter(), DEFAULT_LIMIT if time_limit is None else time_limit
+    with progress(f"bounding the exit times of {name_text(subject.name)}", limit) as tell:
         from certbound.safety.first_exits import bound_exit_times
 
-        found = bound_exit_times(subject)
+        with Clock(limit, tell).running():
+            found = bound_exit_times(subject)
     result: dict[str, Any] = {**found.to_dict(), "seconds": time.perf_counter() - started}
     if plot is not None:
         from matplotlib.figure import Figure

@@ -42,6 +42,7 @@ from certbound.watch import poll
 
 _MOST_STATES = 3
 _DEGREES = {1: (4, 6), 2: (4, 6), 3: (4,)}
+_MORE_DEGREES = {1: (8, 10), 2: (8, 10), 3: (6,)}  # with efforts that double
 _COARSE, _FINE = {1: 51, 2: 21, 3: 7}, {1: 201, 2: 41, 3: 9}  # points along every side
 _ROUNDS = 3
 _BINDING = 0.2  # of the many points: how many enter the program in every round
@@ -101,7 +102,8 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     def tell(barrier: Barrier) -> None:
         asked.found(_answer(problem, barrier))
 
-    for degree in _DEGREES[work.n]:
+    degrees = _degrees(work.n, asked.effort or 1.0)
+    for degree in degrees:
         try:
             found = work.search(degree, tell, known=best is not None)
         except EngineError:
@@ -110,13 +112,20 @@ def barrier_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
             break
         if found is not None and found.log10_probability(problem.horizon) < level:
             best, level = found, found.log10_probability(problem.horizon)
-        if level <= math.log10(problem.delta) or 0 > level > _FAR * math.log10(problem.delta):
+        if level <= math.log10(problem.delta) or (not asked.at_length and 0 > level > _FAR * math.log10(problem.delta)):
             break
-    if level > math.log10(problem.delta) and work.n < _MOST_STATES:  # in three states that takes a quarter of a minute
-        found = work.steady(_DEGREES[work.n][0], tell, level, 1.0 if asked.thorough else _WORTH)
+    many = work.n == _MOST_STATES and not asked.at_length  # that takes a quarter of a minute
+    if level > math.log10(problem.delta) and not many:
+        found = work.steady(degrees[0], tell, level, 1.0 if asked.thorough else _WORTH)
         best = found if found is not None else best
     none = EngineAnswer(reason="no polynomial barrier was found.", method="barrier")
     return none if best is None else _answer(problem, best)
+
+
+def _degrees(states: int, effort: float) -> tuple[int, ...]:
+    """The degrees of polynomials that are tried: the usual ones, or for more effort one that is higher."""
+    more = _MORE_DEGREES[states]
+    return _DEGREES[states] if effort <= 1 else (more[min(int(math.log2(effort)), len(more) - 1)],)
 
 
 def _answer(problem: Problem, best: Barrier) -> EngineAnswer:

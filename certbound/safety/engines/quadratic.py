@@ -33,9 +33,10 @@ def quadratic_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     try:
         most = next((most for n, most in _SPARED.items() if problem.system.dimension <= n), _SECONDS)
         left = seconds_left()
-        alone = asked.at_length or (asked.thorough and problem.system.dimension >= _FEW and left < math.inf)
+        alone = asked.at_length or (asked.thorough and problem.system.dimension >= _FEW)
         most = min(most, _HASTE) if asked.first else most
-        limit = max(left if alone else min(_SECONDS if asked.thorough else most, left), _LEAST)
+        usual = (asked.effort or 1.0) * _SECONDS if asked.thorough else most
+        limit = max(left if alone and left < math.inf else min(usual, left), _LEAST)
         target = _ANY if asked.first else problem.delta
         if problem.system.time == "discrete":
             before = asked.before if isinstance(asked.before, StepsBound) else StepsBound()

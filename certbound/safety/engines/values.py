@@ -31,6 +31,7 @@ _SPACE = 120.0  # the same for three states in continuous time
 _GRANT = 0.7  # of the time that is left, where all of it may be spent: what does not come to its end is lost
 _LEAST = 1e-3
 _FLOOR = -300.0
+_RATIO, _RATIO_WITH_EFFORT = 1.05, 1.0001  # of the two bounds below which grids are not refined
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
 
@@ -43,18 +44,24 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         return EngineAnswer(applicable=False, method="values", reason=SPARED)
     wide = problem.system.dimension == 3 and not isinstance(problem.system, DiscreteSystem)
     most = _SPACE if wide else _SECONDS
-    most = _GRANT * seconds_left() if asked.at_length else most if asked.thorough else _SECONDS / 4
-    limit = max(min(most, seconds_left()), _LEAST)
+    limit = asked.effort * most if asked.effort is not None else most if asked.thorough else _SECONDS / 4
+    limit = max(limit if asked.effort is not None else min(limit, seconds_left()), _LEAST)
+    return replace(_answered(problem, asked, limit), effort=limit / most)
+
+
+def _answered(problem: Problem, asked: Request, limit: float) -> EngineAnswer:
+    """The answer to work that stands for so many seconds."""
     try:
         if problem.system.time == "continuous" and problem.endless:
             return _lasting(problem)
         if problem.reach is None and serves(problem):
-            whole = max(min(limit, _GRANT * seconds_left()), _LEAST)  # one grid: its steps end, or all is lost
+            part = limit if asked.effort is not None else _GRANT * seconds_left()
+            whole = max(min(limit, part), _LEAST)  # one grid: its steps end, or all is lost
             return _continuous(_confined(problem, limit) or bound_exits_by_steps(problem, seconds=whole))
         if not isinstance(problem.system, DiscreteSystem):
             answer = _continuous(_exits(problem, limit, asked))
             return answer if answer.log10_delta < 0 else _by_rate(problem) or _without_end(problem, limit) or answer
-        found = _failure(problem, limit)
+        found = _failure(problem, limit, _RATIO_WITH_EFFORT if asked.at_length else _RATIO)
     except (InfeasibleError, EnclosureError) as error:
         sure = leaves_surely(problem) if problem.endless else None
         lasting = _surely(problem, sure) if sure is not None else _by_rate(problem) or _without_end(problem, limit)
@@ -140,33 +147,33 @@ def _by_rate(problem: Problem) -> EngineAnswer | None:
     )
 
 
-def _failure(problem: Problem, limit: float) -> FailureBounds:
+def _failure(problem: Problem, limit: float, ratio: float) -> FailureBounds:
+    asked: dict[str, float] = {"seconds": limit, "delta": problem.delta, "ratio": ratio}
     try:  # what noise along one direction leaves to chains otherwise
-        found: FailureBounds | None = bound_directed_failure(problem, seconds=limit, delta=problem.delta)
+        found: FailureBounds | None = bound_directed_failure(problem, **asked)
     except InfeasibleError:
         found = None
     if found is not None and (found.upper < 1 or found.lower > 0):
         return found
-    found = bound_long_run(problem, seconds=limit, delta=problem.delta)
+    found = bound_long_run(problem, **asked)
     if found is not None:
         return found
     target = problem.reach
     try:
         if target is None:
-            return bound_failure(problem, seconds=limit, delta=problem.delta)
+            return bound_failure(problem, **asked)
         if not target.stays:
             first, last = target.during or (0, problem.horizon)
             plain = until(problem, int(last))
-            return bound_failure(plain, target=target.region, since=int(first), seconds=limit, delta=problem.delta)
+            return bound_failure(plain, target=target.region, since=int(first), **asked)
         first, last = target.during or (0, problem.horizon)
         return bound_failure(
-            until(problem, problem.horizon), target=target.region, since=int(first), until=int(last), seconds=limit,
-            delta=problem.delta,
+            until(problem, problem.horizon), target=target.region, since=int(first), until=int(last), **asked
         )
     except InfeasibleError as error:
         refused = str(error)
     try:
-        return bound_chain(problem, seconds=min(2 * limit, seconds_left()), delta=problem.delta)
+        return bound_chain(problem, **asked | {"seconds": min(2 * limit, seconds_left())})
     except InfeasibleError as error:
         raise InfeasibleError(f"{refused.rstrip('.')}; and {error}") from error
 

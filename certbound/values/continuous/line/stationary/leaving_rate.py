@@ -1,17 +1,13 @@
-"""The mean time of leaving an interval and its rate, from both sides, by functions of the state alone.
+"""The rate of leaving an interval, from both sides, by functions of the state alone.
 
-**The mean time** (Dynkin's formula). Let L m = f m' + a m''/2 with a = g^2 >= 0, m twice continuously differentiable
-on [low, high]. Where m >= 0 at the ends and L m <= -(1 - e) < 0 for every disturbance, E tau <= m/(1 - e): m has no
-minimum inside, as L m >= 0 there. Where m <= 0 at the ends and L m >= -(1 + e), E tau >= m/(1 + e).
+Let L v = f v' + a v''/2 with a = g^2 >= 0. Where v <= 0 at the ends and L v >= -k v for every disturbance, e^{kt} v(X)
+is a submartingale until the exit, so that P(not left before T) >= e^{-kT} v(x)/sup v for every T at once. Where p > 0
+on all of [low, high] and L p <= -k p, P(not left before T) <= e^{-kT} p(x)/min p. v is the first eigenfunction of L
+less a little of m with L m = -1 (so that L v > 0 at the ends, where v vanishes), p that of a slightly longer interval.
 
-m is a polynomial that nearly solves L m = -1 (collocation), its coefficients are numbers from there on, and L m is
-enclosed over small cells: m' and m'' at their middles with what is rounded, elsewhere by a bound of the next derivative
-(|T_k^(j)| is largest at 1).
-
-**The rate.** Where v <= 0 at the ends and L v >= -k v for every disturbance, e^{kt} v(X) is a submartingale until the
-exit, so that P(not left before T) >= e^{-kT} v(x)/sup v for every T at once. Where p > 0 on all of [low, high] and
-L p <= -k p, P(not left before T) <= e^{-kT} p(x)/min p. v is the first eigenfunction of L less a little of m (so that
-L v > 0 at the ends, where v vanishes), p that of a slightly longer interval.
+Both are polynomials by collocation, their coefficients are numbers from there on, and L v is enclosed over small
+cells: v' and v'' at their middles with what is rounded, elsewhere by a bound of the next derivative (|T_k^(j)| is
+largest at 1).
 """
 
 from __future__ import annotations
@@ -24,47 +20,19 @@ from flint import arb, arb_poly, fmpq, fmpq_poly
 from numpy.polynomial import chebyshev
 
 from certbound.arrays import Array
-from certbound.errors import InfeasibleError
-from certbound.problem.model import Tape, compile_numpy, sources
+from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem
 from certbound.rigor import rounding
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.coefficients import enclose, squared_diffusion
-from certbound.values.exact import interval_of
+from certbound.values.continuous.coefficients import enclose
+from certbound.values.continuous.line.stationary.mean_time import limits_of, squared_of
 
-_DEGREES = (16, 28, 44)
-_CELLS = (2**11, 2**14)
-_GOOD = 2e-3
-_MOST = 0.5
+_DEGREE = 28
+_CELLS = 2**14
 _LESS = (1e-3, 1e-2, 0.1)  # of m, in units of what the rate may grow by
 _LONGER = (0.001, 0.003, 0.01, 0.03)  # of the interval, at both ends
 _SLACK = 1 + 1e-9
-
-
-def bound_mean_time(problem: Problem) -> tuple[float, float | None] | None:
-    """Bounds of the mean time of leaving from every start, under every disturbance; None where nothing is proved.
-
-    One state in continuous time, a model without t, and an interval that stays; the upper bound is None where only the
-    lower one is proved. An EnclosureError where the model is undefined somewhere in the interval.
-    """
-    ends, square = _interval(problem), _square(problem)
-    if ends is None or square is None:
-        return None
-    best: tuple[float, Array] | None = None
-    tried = [found for degree in _DEGREES if (found := _proposal(problem, square, *ends, degree)) is not None]
-    for count in _CELLS:
-        cells = _Cells(problem, square, *ends, count)
-        for coefficients in tried:
-            error = cells.error(coefficients)
-            if best is None or error < best[0]:
-                best = error, coefficients
-            if error < _GOOD:
-                return _bounds(problem, *ends, *best)
-    if best is None or not best[0] < _MOST:
-        return None
-    return _bounds(problem, *ends, *best)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -107,13 +75,12 @@ class Rate:
 def bound_rate(problem: Problem) -> Rate | None:
     """How fast paths leave, for every horizon at once; None where nothing is proved.
 
-    As `bound_mean_time`: one state in continuous time, a model without t, and an interval that stays.
+    One state in continuous time, a model without t, and an interval that stays.
     """
-    ends, square = _interval(problem), _square(problem)
-    if ends is None or square is None:
+    ends, square = limits_of(problem), squared_of(problem)
+    if ends is None or square is None or not np.isfinite(ends).all():
         return None
-    cells = _Cells(problem, square, *ends, _CELLS[-1])
-    degree = _DEGREES[1]
+    cells, degree = _Cells(problem, square, *ends, _CELLS), _DEGREE
     slow = [_slow(problem, square, cells, degree, less) for less in _LESS]
     above = min((found for found in slow if found is not None), default=None, key=lambda one: one.rate)
     if above is None:
@@ -191,29 +158,6 @@ def _eigenfunction(problem: Problem, square: Tape, low: float, high: float, degr
     return (float(values.real[place]), v / largest) if largest != 0 else None
 
 
-def _square(problem: Problem) -> Tape | None:
-    """g^2, of a model in continuous time without t; None elsewhere."""
-    if not isinstance(problem.system, ContinuousSystem):
-        return None
-    square = squared_diffusion(problem.system.diffusion, problem.system.states)
-    clock = any(0 in slots for tape in (problem.closed_loop, square) for slots in sources(tape))
-    return None if clock else square
-
-
-def _interval(problem: Problem) -> tuple[float, float] | None:
-    """The ends of the safe interval, where it is one that is exactly known."""
-    low, high = -np.inf, np.inf
-    for constraint in problem.constraints:
-        if constraint.outside:
-            return None
-        try:
-            first, last = interval_of(constraint.region)
-        except InfeasibleError:
-            return None
-        low, high = max(low, first), min(high, last)
-    return (low, high) if np.isfinite([low, high]).all() and low < high else None
-
-
 def _proposal(problem: Problem, square: Tape, low: float, high: float, degree: int) -> Array | None:
     """Chebyshev coefficients over [low, high] of a near solution of L m = -1 that vanishes at the ends."""
     rows = _collocation(problem, square, low, high, degree)
@@ -257,10 +201,6 @@ class _Cells:
         time = Interval.point(np.zeros(count))
         self.f = enclose(problem.closed_loop, [time, x, *pushes])[0][0]
         self.a = enclose(square, [time, x])[0][0]
-
-    def error(self, coefficients: Array) -> float:
-        """An upper bound of |L m + 1| over the whole interval."""
-        return float(np.max((self.moved(coefficients) + Interval.point(1.0)).mag))
 
     def moved(self, coefficients: Array) -> Interval:
         """Ranges of L m over the cells, for every disturbance."""
@@ -335,16 +275,6 @@ def _largest(coefficients: Array, order: int) -> float:
             size *= Fraction(max(k * k - i * i, 0), 2 * i + 1)
         total += size
     return float(np.nextafter(float(total), np.inf))
-
-
-def _bounds(problem: Problem, low: float, high: float, error: float, coefficients: Array) -> tuple[float, float | None]:
-    """m over the starts, lifted to what it has to be at the ends, by what L m may miss -1."""
-    least, most = _over_starts(problem, low, high, coefficients)
-    with precision():
-        ends = [arb_poly(_polynomial(coefficients))(arb(end)) for end in (-1, 1)]
-        below = (arb(least) - ends[0].max(ends[1])) / (1 + arb(error))
-        above = (arb(most) - ends[0].min(ends[1])) / (1 - arb(error))
-        return (max(lower(below), 0.0), upper(above)) if np.isfinite(most) else (0.0, None)
 
 
 def _over_starts(problem: Problem, low: float, high: float, coefficients: Array) -> tuple[float, float]:
