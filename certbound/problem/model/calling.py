@@ -34,7 +34,7 @@ def call_network(network: Network, *args: Any) -> Any:
     """
     plain = [arg.view(np.ndarray) if isinstance(arg, Traced) else arg for arg in args]
     whole = len(plain) == 1 and not isinstance(plain[0], Scalar) and np.ndim(plain[0]) > 0
-    entries = list(np.moveaxis(np.asarray(plain[0]), -1, 0)) if whole else plain
+    entries = list(np.moveaxis(np.asarray(plain[0]).view(np.ndarray), -1, 0)) if whole else plain
     if len(entries) != network.inputs:
         raise ValueError(f"`{network.name}` takes {network.inputs} numbers, got {len(entries)}.")
     graph = next((entry.graph for entry in _flat(entries) if isinstance(entry, Scalar)), None)

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from certbound.problem.model.found_layers import with_layers
 from certbound.problem.model.graph import Graph
 from certbound.problem.model.tape import Tape
-from certbound.problem.model.tracer import Scalar, Traced, UntraceableError
+from certbound.problem.model.tracer import Scalar, Traced, UntraceableError, traced_arrays
 
 
 def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) -> Tape:
@@ -73,7 +74,8 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
         values |= scalars
     chosen = {key: values[key] for key in names}
     try:
-        result = function(**chosen)
+        with traced_arrays():
+            result = function(**chosen)
     except UntraceableError as error:
         raise TypeError(f"`{name}` cannot be traced{_place(error)}: {error}.") from error
     except (TypeError, AttributeError) as error:
@@ -160,7 +162,7 @@ def _finish(graph: Graph, result: Any, name: str) -> Tape:
             raise ValueError(
                 f"`{name}` must return finite numbers, got {entry!r} at position {place}."
             ) from error
-    return graph.tape(outputs, array.shape or (1,))
+    return with_layers(graph.tape(outputs, array.shape or (1,)))
 
 
 def _collected(result: Any, name: str) -> np.ndarray[Any, np.dtype[Any]]:
