@@ -22,8 +22,9 @@ ACTIVATIONS: dict[str, list[Callable[[Any], Any]]] = {
     "tanh": [np.tanh],
     "sin": [np.sin],
     "relu": [
-        lambda v: np.maximum(0, v), lambda v: np.maximum(v, 0.0), lambda v: np.where(v > 0, v, 0), lambda v: v * (v > 0),
-        lambda v: np.where(v < 0, 0, v), lambda v: np.where(0 <= v, v, 0.0), lambda v: np.clip(v, 0, None),
+        lambda v: np.maximum(0, v), lambda v: np.maximum(v, 0.0), lambda v: np.where(v > 0, v, 0),
+        lambda v: v * (v > 0), lambda v: np.where(v < 0, 0, v), lambda v: np.where(v >= 0, v, 0.0),
+        lambda v: np.clip(v, 0, None),
         lambda v: np.array([np.maximum(entry, 0) for entry in v]), lambda v: np.where(~(v > 0), 0, v),
     ],
     "sigmoid": [
@@ -73,7 +74,8 @@ def test_an_activation_however_it_is_written_makes_the_layers_of_its_network(act
     for f in ACTIVATIONS[activation]:
         tape = trace(lambda x, f=f: WRITINGS["@"](x, f), {"x": ["a", "b"]})
         (network,) = networks_of(tape)
-        assert [node.op for node in tape.nodes[:2]] == ["input", "input"] and len(tape.nodes) == 3
+        assert [node.op for node in tape.nodes[:2]] == ["input", "input"]
+        assert len(tape.nodes) == 3
         assert [layer.activation for layer in network.layers] == [activation, activation, "linear"]
         for layer, weights, bias in zip(network.layers, (W1, W2, W3), (B1, B2, B3)):
             np.testing.assert_array_equal(np.array(layer.weights), weights)
@@ -99,7 +101,8 @@ def test_what_stands_around_a_network_stays_as_it_is() -> None:
 
     tape = trace(model, {"x": ["a", "b"]})
     (network,) = networks_of(tape)
-    assert [len(layer.bias) for layer in network.layers] == [16, 16, 1] and network.inputs == 2
+    assert [len(layer.bias) for layer in network.layers] == [16, 16, 1]
+    assert network.inputs == 2
     counted = Counter(node.op for node in tape.nodes)
     assert counted["sin"] == counted["div"] == counted["max"] == counted["min"] == counted["network"] == 1
     plain = [[float(value) for value in model(point)] for point in POINTS.T]
@@ -124,14 +127,16 @@ def test_sums_of_outputs_do_not_join_networks() -> None:
 
     tape = trace(model, {"x": ["a", "b"]})
     found = networks_of(tape)
-    assert len(found) == 6 and all(len(layer.bias) <= 16 for network in found for layer in network.layers)
+    assert len(found) == 6
+    assert all(len(layer.bias) <= 16 for network in found for layer in network.layers)
     np.testing.assert_allclose(values(tape), [[float(v) for v in model(p)] for p in POINTS.T], rtol=1e-12, atol=1e-12)
 
 
 def test_a_rounded_scale_between_layers_is_a_layer_of_its_own() -> None:
     tape = trace(lambda x: W3 @ np.tanh(0.1 * (W2 @ np.tanh(0.3 * (W1 @ x) + B1)) + B2 + 0.7), {"x": ["a", "b"]})
     (network,) = networks_of(tape)
-    assert network.inputs == 2 and len(tape.nodes) == 3
+    assert network.inputs == 2
+    assert len(tape.nodes) == 3
     assert {layer.activation for layer in network.layers} == {"tanh", "linear"}
     expected = [W3 @ np.tanh(0.1 * (W2 @ np.tanh(0.3 * (W1 @ p) + B1)) + B2 + 0.7) for p in POINTS.T]
     np.testing.assert_allclose(values(tape), expected, rtol=1e-12, atol=1e-13)
@@ -143,7 +148,8 @@ def test_connections_that_skip_a_layer_leave_shorter_networks() -> None:
         return x + W3[0] @ np.tanh(W2 @ first + W1 @ x) + first[0] * first[1]
 
     tape = trace(model, {"x": ["a", "b"]})
-    assert networks_of(tape) and len(tape.nodes) < 700
+    assert networks_of(tape)
+    assert len(tape.nodes) < 700
     np.testing.assert_allclose(values(tape), [model(point) for point in POINTS.T], rtol=1e-12, atol=1e-13)
 
 
@@ -163,12 +169,14 @@ def _fractions(tape: Tape, inputs: list[Fraction]) -> list[Fraction]:
     zero = Fraction(0)
     table: dict[str, Callable[..., Any]] = {
         "const": Fraction, "add": lambda a, b: a + b, "sub": lambda a, b: a - b, "neg": lambda a: -a,
-        "mul": lambda a, b: a * b, "div": lambda a, b: a / b if b else zero, "max": max, "min": min, "sq": lambda a: a * a,
+        "mul": lambda a, b: a * b, "div": lambda a, b: a / b if b else zero, "max": max, "min": min,
+        "sq": lambda a: a * a,
         "lt": lambda a, b: Fraction(a < b), "le": lambda a, b: Fraction(a <= b), "not": lambda a: Fraction(a == 0),
         "if_else_zero": lambda c, a: a if c else zero,
     }  # fmt: skip
     phi: dict[str, Callable[..., Fraction]] = {
-        "linear": lambda v: v, "relu": lambda v: max(v, zero), "clip": lambda v, a, b: min(max(v, Fraction(a)), Fraction(b)),
+        "linear": lambda v: v, "relu": lambda v: max(v, zero),
+        "clip": lambda v, a, b: min(max(v, Fraction(a)), Fraction(b)),
         "leaky_relu": lambda v, s: v if v > 0 else Fraction(s) * v,
     }  # fmt: skip
 
