@@ -108,7 +108,8 @@ class LinearTube(Tightening):
         events = [self.events.along(rows[:, index]) for index in range(rows.shape[1])]
         shapes = np.stack([event.profile for event in events], axis=1)
         if isinstance(self.events, StepEvents):
-            return np.asarray(shapes * np.array([self._factor(event) for event in events]))
+            levels = [event.capped(self._factor(event) * event.profile) for event in events]
+            return np.stack(levels, axis=1)
         if key not in self.factors:
             self.factors[key] = self._factor(events[int(np.argmax(shapes.max(axis=0)))])
         return np.asarray(shapes * self.factors[key])

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.gaussian.response.bounded_noise import BoundedNoise, reach_along
 from certbound.gaussian.response.linear_response import LinearResponse
 from certbound.gaussian.response.martingale_windows import (
     ROUND,
@@ -28,10 +29,16 @@ def _product_rounding(n: int) -> float:
 
 
 class StepEvents:
-    """Discrete time. ``gaussian`` noise: first exceedances; any other sub-Gaussian law: the union bound."""
+    """Discrete time. ``gaussian`` noise: first exceedances; any other sub-Gaussian law: the union bound.
 
-    def __init__(self, response: LinearResponse, cell: int, gaussian: bool) -> None:
+    ``bounded``: the noise, where its entries are bounded and Z begins at 0: no level beyond its reach is exceeded.
+    """
+
+    def __init__(
+        self, response: LinearResponse, cell: int, gaussian: bool, bounded: BoundedNoise | None = None
+    ) -> None:
         self.response, self.cell, self.gaussian = one_cell(response, cell), cell, gaussian
+        self.bounded = bounded
         self.shared_log = -np.inf
         self.found: dict[bytes, StepEvent] = {}
 
@@ -53,7 +60,8 @@ class StepEvents:
         nodes = np.arange(len(rows))
         variances = [v[0] for v in self.response.variance(rows[None], nodes)]
         if not self.gaussian:
-            return StepEvent(variances[0], variances[1], None)
+            reach = None if self.bounded is None else reach_along(self.response, rows, self.bounded)
+            return StepEvent(variances[0], variances[1], None, reach)
         low, high = variances
         following = np.einsum("ti,tij->tj", rows[1:], self.response.transition[0, : len(rows) - 1])
         # the row at t + 1 seen from t is w F up to the rounding of this product
@@ -76,12 +84,17 @@ class StepEvent:
     low: Array
     high: Array
     correlation: Array | None
+    reach: Array | None = None  # what the row's value never exceeds
     known: dict[bytes, float] = field(default_factory=dict)  # the last few bounds found, by the levels' bytes
 
     @property
     def profile(self) -> Array:
         """Shape of levels: the standard deviation."""
         return np.asarray(np.sqrt(np.maximum(self.high, 0.0)))
+
+    def capped(self, levels: Array) -> Array:
+        """Levels that cost no more, the reach where they lie beyond it."""
+        return levels if self.reach is None else np.minimum(levels, self.reach)
 
     def log_exceedance(self, levels: Array) -> float:
         """Upper bound of log P(exists t: rows[t] . Z_t > levels[t])."""
@@ -97,6 +110,8 @@ class StepEvent:
     def _log_exceedance(self, levels: Array) -> float:
         above = ratio_down(levels, self.high)
         if self.correlation is None:
+            if self.reach is not None:
+                above = np.where(levels >= self.reach, np.inf, above)
             with np.errstate(over="ignore"):
                 exponent = -0.5 * np.minimum(above, 1e150) ** 2
             return min(logsumexp(np.where(above == np.inf, -np.inf, exponent * (1 - 1e-15))), 0.0)
