@@ -40,7 +40,7 @@ SLACK = 0.01
 _NEAR = 0.9  # of the logarithm that the engine proved
 _LIKELY = -2.0  # log10 of a probability of which a per cent matters
 _LOG10 = math.log(10.0)
-_LEAST = -1e12  # log10 of the smallest probability that is told apart from 0
+_SMALLEST = -1e12  # log10 of a probability that is not told apart from 0
 
 
 def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
@@ -65,7 +65,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
             break
     if best is None:
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
-    log10 = max(best[1].log_probability / _LOG10, _LEAST)
+    log10 = max(best[1].log_probability / _LOG10, _SMALLEST)
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
     slack = SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
     return proof_data(best[0].engine.problem, *best, cuts_of(answer)), min(log10 + slack, 0.0), []
