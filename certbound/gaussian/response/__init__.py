@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from certbound.gaussian.response.adjoint_rows import RowResponse
-from certbound.gaussian.response.bounded_noise import BoundedNoise
 from certbound.gaussian.response.clocks import ClockEvents, SteadyEvent
 from certbound.gaussian.response.events import WindowEvents
 from certbound.gaussian.response.levels import level_along, level_scale
@@ -18,12 +17,11 @@ from certbound.gaussian.response.martingale_windows import logsumexp
 from certbound.gaussian.response.martingales import MartingaleEvent, Martingales, SplitEvents, Windowed, quantile
 from certbound.gaussian.response.occupancy import log_occupancy
 from certbound.gaussian.response.overlaps import log_any_exceedance
-from certbound.gaussian.response.step_events import StepEvent, StepEvents
+from certbound.gaussian.response.step_events import StepEvents
 from certbound.gaussian.response.unions_below import Exceedances
 
 __all__ = [
     "balanced",
-    "BoundedNoise",
     "ClockEvents",
     "continuous_response",
     "discrete_response",
@@ -41,7 +39,6 @@ __all__ = [
     "RowResponse",
     "SplitEvents",
     "SteadyEvent",
-    "StepEvent",
     "StepEvents",
     "Windowed",
     "WindowEvents",

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from certbound.problem.model.found_layers import with_layers
 from certbound.problem.model.graph import Graph
+from certbound.problem.model.networks_found import with_layers
 from certbound.problem.model.tape import Tape
 from certbound.problem.model.tracer import Scalar, Traced, UntraceableError, traced_arrays
 

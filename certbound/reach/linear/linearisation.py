@@ -11,7 +11,6 @@ import numpy as np
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response import (
-    BoundedNoise,
     LinearResponse,
     StepEvents,
     balanced,
@@ -318,10 +317,8 @@ class Linearisation:
         """Scalar events of one cell in discrete time."""
         assert isinstance(self.system, DiscreteSystem)
         law = self.system.noise
-        bounded = None
-        if isinstance(law, BoxLaw) and not np.any(self.start_covariance):
-            noise = BoundedNoise(matrix=self.system.noise_matrix, halfwidth=law.bound)
-            bounded = noise if noise.affordable(self.pieces) else None
+        still = isinstance(law, BoxLaw) and not np.any(self.start_covariance)
+        bounded = (self.system.noise_matrix, law.bound) if still and law.bound is not None else None
         return StepEvents(self.response, cell, bool(law.gaussian), bounded)
 
     @property

@@ -18,7 +18,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import CertificateError
-from certbound.gaussian.response import StepEvent, StepEvents, WindowEvents, level_scale, logsumexp
+from certbound.gaussian.response import StepEvents, WindowEvents, level_scale, logsumexp
 from certbound.problem.model import Tape, compile_numpy, jacobian, varying_outputs
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
@@ -178,7 +178,8 @@ def _levels(run: LinearRun, nonlinear: Share) -> _Levels | None:
             if event.profile.max() > 0:
                 profile = np.maximum(event.profile, _LEAST * event.profile.max())
                 found = level_scale(event, event.profile, share) * profile
-                levels[cell, :, d] = event.capped(found) if isinstance(event, StepEvent) else found
+                capped = own.along(run.rows[cell, :, d]).capped if isinstance(own, StepEvents) else np.asarray
+                levels[cell, :, d] = capped(found)
             logs.append(math.log(2.0) + event.log_exceedance(levels[cell, :, d]))
         events.append(own)
         spent.append(logs)

@@ -9,8 +9,8 @@ import pytest
 
 import certbound as cb
 from certbound.arrays import Array
-from certbound.gaussian.response import BoundedNoise, StepEvents, discrete_response, level_along
-from certbound.gaussian.response.bounded_noise import reach_along
+from certbound.gaussian.response import StepEvents, discrete_response, level_along
+from certbound.gaussian.response.step_events import BoundedNoise, reach_along
 from certbound.reach.linear import Linearisation
 
 STEPS = 5
@@ -51,7 +51,7 @@ def test_slopes_that_are_no_floats_widen_it() -> None:
 
 
 def test_a_level_at_the_reach_is_never_exceeded_and_one_below_may_be() -> None:
-    event = StepEvents(response(), 0, False, NOISE).along(ROWS)
+    event = StepEvents(response(), 0, False, (NOISE.matrix, NOISE.halfwidth)).along(ROWS)
     assert event.log_exceedance(event.reach) == -np.inf
     below = event.reach.copy()
     below[3] *= 0.999

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certbound.problem.model import Graph, Network, Part, Tape, compile_numpy, found_layers, trace
-from certbound.problem.model.found_layers import with_layers
+from certbound.problem.model import Graph, Layer, Network, Part, Tape, compile_numpy, trace
+from certbound.problem.model.networks_found import with_layers, written_layers
 
 RNG = np.random.default_rng(0)
 W1, W2, W3 = RNG.normal(size=(16, 2)), RNG.normal(size=(16, 16)) / 4, RNG.normal(size=(1, 16)) / 4
@@ -221,8 +221,8 @@ def _drawn(rng: np.random.Generator) -> Tape:
 
 
 def test_random_tapes_stay_the_same_function_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(found_layers, "LEAST_WEIGHTS", 2)
-    monkeypatch.setattr(found_layers, "LEAST_DENSITY", 0.0)
+    monkeypatch.setattr(written_layers, "LEAST_WEIGHTS", 2)
+    monkeypatch.setattr(written_layers, "LEAST_DENSITY", 0.0)
     found = 0
     for seed in range(500):
         rng = np.random.default_rng(seed)
@@ -236,7 +236,7 @@ def test_random_tapes_stay_the_same_function_exactly(monkeypatch: pytest.MonkeyP
 
 
 def test_outputs_that_need_each_other_are_networks_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(found_layers, "LEAST_WEIGHTS", 2)
+    monkeypatch.setattr(written_layers, "LEAST_WEIGHTS", 2)
 
     def model(x: Any) -> Any:
         one, two, three = np.tanh(x[0] + x[1]), np.tanh(x[0] - 2 * x[1]), np.tanh(x[1])
@@ -252,6 +252,6 @@ def test_outputs_that_need_each_other_are_networks_of_their_own(monkeypatch: pyt
 def test_a_part_of_a_network_that_was_called_stays_one() -> None:
     graph = Graph(["a"])
     rows = [[float(k)] for k in range(1, 4)]
-    network = Network(layers=tuple(found_layers.Layer(tuple(map(tuple, rows)), (0.0,) * 3, "tanh") for _ in range(1)))
+    network = Network(layers=tuple(Layer(tuple(map(tuple, rows)), (0.0,) * 3, "tanh") for _ in range(1)))
     tape = graph.tape([graph.part(Part(network, 0), (graph.input(0),))], (1,))
     assert with_layers(tape) is tape

@@ -14,13 +14,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from certbound.problem.model.activations_found import Read, activation_of
 from certbound.problem.model.graph import Graph
 from certbound.problem.model.network_data import MOST_LAYERS, Layer, Network, Part
+from certbound.problem.model.networks_found.written_activations import Read, activation_of
 from certbound.problem.model.tape import Tape
 
 LEAST_WEIGHTS = 200
-"""Products of a network below which it stays written out: all methods know single operations, and are as fast."""
+"""Products of a network below which it stays written out: all methods know single operations, some no networks.
+
+With 192 products in one layer the linear response takes .55 s for 1.2 s of processor time, constants 7.1 s for 5.2 s.
+"""
 LEAST_DENSITY = 0.25
 """Share of a network's weights that are not 0, below which it stays written out: a chain of springs is no network."""
 _ANY = -1  # the layer of constants, which go with every layer

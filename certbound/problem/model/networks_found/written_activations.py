@@ -5,7 +5,7 @@ max(a, 0), ``where(a > 0, a, 0)`` and a (a > 0) are one function of a, as are 1/
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from certbound.problem.model.tape import Node
@@ -148,7 +148,7 @@ def _logarithm(nodes: Nodes, of: int) -> Read | None:
     return None if argument is None else Read("softplus", argument)
 
 
-_READERS = {
+_READERS: dict[str, Callable[..., Read | None]] = {
     "tanh": lambda nodes, a: Read("tanh", a),
     "sin": lambda nodes, a: Read("sin", a),
     "max": _maximum,
