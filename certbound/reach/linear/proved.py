@@ -45,7 +45,7 @@ class LinearAnswer:
     @property
     def impossible(self) -> bool:
         """Whether the probability is 0, or too small to be told from it."""
-        return self.outcome.log_probability / np.log(10.0) <= answer_tubes.LEAST
+        return bool(self.outcome.log_probability / np.log(10.0) <= answer_tubes.LEAST)
 
     @property
     def engine(self) -> Linearisation:

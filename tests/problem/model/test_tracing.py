@@ -43,7 +43,7 @@ FUNCTIONS = {
     "comparisons of an array of entries": lambda x: (
         np.where(np.array([x[0], x[1]]) > 0, 1.0, 2.0) + np.maximum(0, np.asarray([x[2], x[0]]))
     ),
-    "an array of entries and numbers": lambda x: np.sin(np.array([x[0], 1.0])) * np.abs(np.array([[x[1]], [x[2]]]))[:, 0],
+    "an array of entries and numbers": lambda x: np.sin(np.array([x[0], 1.0])) * np.array([[x[1]], [x[2]]])[:, 0],
     "plain array of entries": lambda x: np.sin(np.array([x[0], x[1]])) * 2 + np.array([x[2], 1.0]),
 }
 
