@@ -20,7 +20,7 @@ from flint import arb, arb_mat, ctx
 
 from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums, upper
 from certbound.checker.linear.diffusion import Along, Asked, StateNoise, Stopped
-from certbound.checker.linear.events import Windows, chain, sub_gaussian
+from certbound.checker.linear.events import Windows, bounded_drives, chain, sub_gaussian
 from certbound.checker.linear.families import Family, leaving
 from certbound.checker.linear.remainder import OutputRemainder, PieceData, Polytope, remainders
 from certbound.checker.linear.response import (
@@ -412,6 +412,13 @@ class _Cell:
         sizes = [part.probability * (2 if d < inner else 1) for d, part in enumerate(found[1])]
         return upper(sum(sizes, total + found[0]))
 
+    def _drives(self, moves: list[arb_mat]) -> list[arb_mat] | None:
+        """What noise of bounded entries does at most; None where these or the start have no bounds."""
+        noise = self.model.noise
+        if noise.halfwidth is None or self.model.initial.covariance is not None:
+            return None
+        return bounded_drives(moves, noise.constant(), noise.halfwidth, self.budget)
+
     def _leaving(self, values: list[arb_mat], families: list[Family]) -> arb:
         """The probability of all families of events together."""
         model, budget = self.model, self.budget
@@ -421,7 +428,8 @@ class _Cell:
             moves = [piece.transition for piece in self.pieces]
             if model.noise.gaussian:
                 return leaving(families, lambda f: chain(f.rows, f.levels, moves, values, budget), budget, normal=True)
-            return leaving(families, lambda f: sub_gaussian(f.rows, f.levels, values, budget), budget)
+            drives = self._drives(moves)
+            return leaving(families, lambda f: sub_gaussian(f.rows, f.levels, values, budget, drives), budget)
         given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
         windows = Windows(self.pieces, values, self.shared.windows, budget)
         paid = windows.coordinates([[arb(x) for x in item] for item in given])

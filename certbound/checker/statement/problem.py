@@ -40,7 +40,8 @@ class Noise:
 
     ``proxy`` is the covariance (or variance proxy) of w in discrete time, the identity in continuous time, None where a
     law has none. ``gaussian`` says whether it is exactly normal; ``uniform`` holds the halfwidths of independent
-    uniform entries; ``entries`` the sizes of independent entries of one law, whose pieces at size 1 ``cut`` makes.
+    uniform entries; ``entries`` the sizes of independent entries of one law, whose pieces at size 1 ``cut`` makes;
+    ``halfwidth`` what no entry exceeds in size, None where nothing is known.
     """
 
     diffusion: arb_mat | Tape
@@ -49,6 +50,7 @@ class Noise:
     uniform: tuple[arb, ...] | None = None
     entries: tuple[arb, ...] = ()
     cut: Callable[[int], list[Piece]] | None = None
+    halfwidth: tuple[arb, ...] | None = None
 
     def constant(self) -> arb_mat:
         """A constant matrix; CertificateError of a tape."""
@@ -274,13 +276,13 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
     record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
     drives, m = _drives(record, "matrix", states)
     proxy, sizes = _proxy(record, law, m, budget)
-    cut = law.cut
+    cut, halfwidth = law.cut, sizes if law.bounded else None
     if cut is None:
-        return Noise(diffusion=drives, proxy=proxy, gaussian=law.gaussian)
+        return Noise(diffusion=drives, proxy=proxy, gaussian=law.gaussian, halfwidth=halfwidth)
     found = [numbers(record["tables"][table], record.at(table), None) for table in law.tables]
     return Noise(
         diffusion=drives, proxy=proxy, gaussian=law.gaussian, uniform=sizes if law.uniform else None, entries=sizes,
-        cut=lambda count: cut(count, found),
+        cut=lambda count: cut(count, found), halfwidth=halfwidth,
     )  # fmt: skip
 
 

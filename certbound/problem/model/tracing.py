@@ -13,8 +13,9 @@ import numpy as np
 from certbound.problem.model import network_rows
 from certbound.problem.model.graph import Graph
 from certbound.problem.model.network_data import Network, Part
+from certbound.problem.model.networks_found import with_layers
 from certbound.problem.model.tape import Tape
-from certbound.problem.model.tracer import Scalar, Traced, UntraceableError
+from certbound.problem.model.tracer import Scalar, Traced, UntraceableError, traced_arrays
 
 
 def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) -> Tape:
@@ -75,7 +76,8 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
         values |= scalars
     chosen = {key: values[key] for key in names}
     try:
-        result = function(**chosen)
+        with traced_arrays():
+            result = function(**chosen)
     except UntraceableError as error:
         raise TypeError(f"`{name}` cannot be traced{_place(error)}: {error}.") from error
     except (TypeError, AttributeError) as error:
@@ -162,7 +164,7 @@ def _finish(graph: Graph, result: Any, name: str) -> Tape:
             raise ValueError(
                 f"`{name}` must return finite numbers, got {entry!r} at position {place}."
             ) from error
-    return graph.tape(outputs, array.shape or (1,))
+    return with_layers(graph.tape(outputs, array.shape or (1,)))
 
 
 def _collected(result: Any, name: str) -> np.ndarray[Any, np.dtype[Any]]:
@@ -209,7 +211,7 @@ def call_network(network: Network, *args: Any) -> Any:
     """
     plain = [arg.view(np.ndarray) if isinstance(arg, Traced) else arg for arg in args]
     whole = len(plain) == 1 and not isinstance(plain[0], Scalar) and np.ndim(plain[0]) > 0
-    entries = list(np.moveaxis(np.asarray(plain[0]), -1, 0)) if whole else plain
+    entries = list(np.moveaxis(np.asarray(plain[0]).view(np.ndarray), -1, 0)) if whole else plain
     if len(entries) != network.inputs:
         raise ValueError(f"`{network.name}` takes {network.inputs} numbers, got {len(entries)}.")
     graph = next((entry.graph for entry in _flat(entries) if isinstance(entry, Scalar)), None)

@@ -12,10 +12,17 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
-from certbound.gaussian.response import LinearResponse, balanced, continuous_response, discrete_response
+from certbound.gaussian.response import (
+    LinearResponse,
+    StepEvents,
+    balanced,
+    continuous_response,
+    discrete_response,
+)
 from certbound.problem.model import Tape, compile_numpy, compile_scalar
+from certbound.problem.noise import BoxLaw
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.reach.linear.inclusion import Gathering, Supports, gathering_of
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.reach.remainder import Frame, Remainder
@@ -307,6 +314,14 @@ class Linearisation:
         covariance = (covariance + covariance.T) / 2
         bound = 8 * (len(proxy) + 2) * 2.0**-53 * float((np.abs(g) @ np.abs(proxy) @ np.abs(g).T).max(initial=0.0))
         return discrete_response(slope, covariance, bound, start, slope_error=self.slope_error)
+
+    def step_events(self, cell: int) -> StepEvents:
+        """Scalar events of one cell in discrete time."""
+        assert isinstance(self.system, DiscreteSystem)
+        law = self.system.noise
+        still = isinstance(law, BoxLaw) and not np.any(self.start_covariance)
+        bounded = (self.system.noise_matrix, law.bound) if still and law.bound is not None else None
+        return StepEvents(self.response, cell, bool(law.gaussian), bounded)
 
     @property
     def _slope_slack(self) -> Interval:
