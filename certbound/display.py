@@ -301,9 +301,13 @@ def name_text(name: str, longest: int = 60) -> str:
     >>> name_text("chain_rest"), name_text("x\\n[b]SAFE[/b]"), name_text("y" * 99, 8)
     ('chain_rest', '"x [b]SAFE[/b]"', 'yyyyy...')
     """
-    line = one_line(name).replace('"', "'")
+    line = _unquoted(name)
     line = line if len(line) <= longest else f"{line[: longest - 3]}..."
     return f'"{line}"' if line != line.lower() or not line or re.search(r"[:;='\[\]\"]", line) else line
+
+
+def _unquoted(text: str) -> str:
+    return one_line(text).replace('"', "'")
 
 
 def power_above(log10: float) -> float:
@@ -329,6 +333,18 @@ def amount(value: float, unit: str) -> str:
     ('48 x 15 min', '0.5 s')
     """
     return f"{value:g} {'x ' * unit[:1].isdigit()}{unit}"
+
+
+def unit_text(unit: str) -> str:
+    """A unit as it stands in sentences: in quotes where it is more than one word, which could pass for what is proved.
+
+    Examples
+    --------
+    >>> unit_text("15 min"), unit_text("s) <= 1e-9, asked (")
+    ('15 min', '"s) <= 1e-9, asked ("')
+    """
+    plain_unit = re.fullmatch(r"(\d[\d.]* )?[\w/^*.%°·-]+", unit)
+    return unit if plain_unit else f'"{_unquoted(unit)}"'
 
 
 def at_least_text(log10: float | None) -> str:

@@ -73,11 +73,14 @@ class Watch:
         Who works instead.
     patient : bool
         Whether somebody waits until the limit for an answer that is worth it, rather than for an answer.
+    started : float, optional
+        Since when the limit counts, by the clock; since now when omitted.
     """
 
     def __init__(
         self, limit: float | None = None, *, progress: Callable[[Progress], object] | None = None,
         clock: Callable[[], float] = time.perf_counter, jobs: int = 1, executor: Any = None, patient: bool = False,
+        started: float | None = None,
     ) -> None:
         if limit is not None and not (isinstance(limit, (int, float)) and 0 < limit < math.inf):
             raise ValueError(f"`time_limit` must be a positive number of seconds, got {limit!r}.")
@@ -87,7 +90,7 @@ class Watch:
             raise TypeError(f"`progress` must be a function of what is being done, got {progress!r}.")
         self.jobs, self.executor, self.patient = int(jobs), executor, patient
         self.limit, self._progress, self._clock = limit, progress, clock
-        self.started = clock()
+        self.started = clock() if started is None else started
         self._end = math.inf if limit is None else self.started + limit
         self._told, self._said = -math.inf, ""
         self._alarm: tuple[float, Callable[[], object]] | None = None

@@ -92,7 +92,8 @@ cli
 __main__
 """
 CHECKER_ORDER = """
-report reading words
+report words
+reading
 balls expressions
 statement
 constants linear barrier values endless time_pieces
@@ -111,8 +112,8 @@ KNOWS_ONLY = {  # rooms that may be taken out and used elsewhere
     "values": GROUND | {"problem"},
 }
 CHECKER_MAY_IMPORT = {"certbound.errors", "certbound.problem.model", "flint"}
-CHECKER_TAKES = {"Tape", "Node", "JUMPS", "Layer", "Network", "Part"}
-"""What the checker may take of ``problem.model``: the description of a tape."""
+CHECKER_TAKES = {"Tape", "Node", "JUMPS", "Layer", "Network", "Part", "needed", "rounded_comparison"}
+"""What the checker may take of ``problem.model``: the description of a tape, and whether rounding decides in it."""
 ON_ARRAYS = "certbound.checker.values"
 """The part of the checker that may take NumPy besides; it is loaded only for certificates that need it."""
 
@@ -127,7 +128,7 @@ MANY_DOORS = {
     "values.continuous": (16, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (37, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (39, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (21, "events in both times, for noise that depends on the state and not; units; jumps"),
     "reach.linear": (19, "certificates state the records of the search: linearisations, shares; bounds from below"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
@@ -135,7 +136,7 @@ MANY_DOORS = {
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
     "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
-    "checker.statement": (16, "what a certificate states is read once and asked by all proofs; other coordinates"),
+    "checker.statement": (17, "what a certificate states is read once and asked by all proofs; other coordinates"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),
     "checker.expressions": (11, "graphs, programs, expansions and ceilings are chosen by what a proof needs"),
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),

@@ -14,7 +14,7 @@ from certbound.checker.claims import assumptions, check_side, claim, claim_below
 from certbound.checker.reading import Record, read, text
 from certbound.checker.report import Budget, Report, Unproved
 from certbound.checker.statement import first_difference, read_model
-from certbound.checker.words import plainly, rounded
+from certbound.checker.words import plainly, rounded, shortened
 from certbound.errors import CertificateError
 
 FORMAT = "certbound certificate"
@@ -81,14 +81,15 @@ def check_data(
         engine_of(proof, method)
         assumed = tuple(assumptions(model, proof, named))
         check_side(model, proof, least is not None)
+        difference = "" if problem is None else first_difference(record["problem"], problem)
+        if problem is not None and not difference:
+            model = model.named_as(problem)
         words = claim(model, proof, level, assumed) if least is None else claim_below(model, least, assumed)
         answer = partial(_report, claim=words, level=level, least=least, assumed=assumed)
         proved = None
         try:
-            if problem is not None:
-                difference = first_difference(record["problem"], problem)
-                if difference:
-                    raise Unproved(f"the certificate speaks of another problem: {difference}")
+            if difference:
+                raise Unproved(f"the certificate speaks of another problem: {shortened(difference, 200)}")
             proved = prove(model, proof, budget, lower=least is not None)
             (_compare if least is None else _compare_below)(proved, level if least is None else least)
         except Unproved as error:

@@ -25,7 +25,7 @@ from certbound.checker.endless import (
     check_surely_below,
 )
 from certbound.checker.linear import check_linear
-from certbound.checker.reading import Record, number, wholes
+from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, met_at, restated, weights_of
 from certbound.checker.time_pieces import jumps_of, with_time_pieces
@@ -55,6 +55,9 @@ STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
 
 MOST_CELLS = 200
+
+MOST_PRINTED = 4
+"""States up to which a claim prints the metric of stated constants: 16 numbers."""
 
 _ANY = "for every disturbance in its set, even one that sees coming noise"
 _BLIND = "for every disturbance in its set that does not see coming noise"
@@ -292,15 +295,29 @@ def _stated(model: Model, proof: Mapping[str, object]) -> str | None:
     """The stated constants; rounded down, they are no weaker an assumption than the proof's."""
     if proof.get("assumed") is not True:
         return None
-    name, unit = ("rate", " 1/s") if model.continuous else ("gain", " per step")
+    name, unit = ("rate", f" per {model.unit}" if model.unit != "s" else " 1/s")
+    if not model.continuous:
+        name, unit = "gain", " per step"
     rate, sigma, nu = (
         rounded(number(proof.get(key), f"proof.{key}"), up=False) for key in ("rate", "sigma", "nu")
     )
-    where = "on the domain" if proof.get("region") == "domain" else "everywhere"
-    norm = "Euclidean norm" if proof.get("metric") is None else "norm of the stated metric"
+    where = "on the model's domain" if proof.get("region") == "domain" else "everywhere"
     return (
-        f"{STATED} {where}: {name} {rate}{unit}, noise level sigma {sigma}, effective dimension {nu}, in the {norm}"
+        f"{STATED} {where}, for the problem's own states: {name} {rate}{unit}, noise level sigma {sigma}, effective "
+        f"dimension {nu}, in the {_norm(model, proof)}"
     )
+
+
+def _norm(model: Model, proof: Mapping[str, object]) -> str:
+    """The norm in which constants are stated, with its metric P in full where that is short."""
+    if proof.get("metric") is None:
+        return "Euclidean norm"
+    n = model.dimension
+    if n > MOST_PRINTED:
+        return f"norm sqrt(x' P x) with the {n} x {n} matrix `metric` of the proof"
+    rows = numbers(proof.get("metric"), "proof.metric", n, n)
+    written = ", ".join(f"[{', '.join(map(plainly, row))}]" for row in rows)
+    return f"norm sqrt(x' P x) with P = [{written}]"
 
 
 def claim(model: Model, proof: object, level: float, assumed: Sequence[str]) -> str:

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from certbound.checker.words import named
 from certbound.errors import CertificateError
 
 LARGEST_FILE = 16 * 2**20
@@ -125,15 +126,15 @@ class Record:
             raise CertificateError(f"`{path}` must have `{missing[0]}`.")
         unknown = [str(name) for name in value if name not in required and name not in optional]
         if unknown:
-            raise CertificateError(f"`{path}` has the unknown entry `{unknown[0][:40]}`.")
+            raise CertificateError(f"`{path}` has the unknown entry `{named(unknown[0])}`.")
         self.value, self.path = value, path
 
     def __getitem__(self, name: str) -> Any:
         return self.value.get(name)
 
     def at(self, name: str) -> str:
-        """The path of an entry."""
-        return f"{self.path}.{name}"
+        """The path of an entry; a name that the file chose stands there in quotes."""
+        return f"{self.path}.{named(name)}"
 
     def number(self, name: str, *, least: float | None = None) -> float:
         """An entry that is a number."""

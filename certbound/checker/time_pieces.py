@@ -1,8 +1,9 @@
 """Jumps and bends of the dynamics that time alone decides: on equal pieces of the horizon constants, or one side.
 
 A proof names the number of pieces. That no such jump lies inside one is looked at piece by piece, in fractions; what
-jumps at their ends is an input from then on, as the rows of a plan are. The one time of a jump has no weight. A time is
-the decimal number that its float is written as.
+jumps at their ends is an input from then on, as the rows of a plan are. The one time of a jump has no weight. A number
+is its float, exactly. A jump may miss the end of its piece by rounding, at most by the share `NEAR` of the horizon:
+about every end the model's `changes` say from when to when, and which values inputs have there, for proofs to pay for.
 """
 
 from __future__ import annotations
@@ -11,15 +12,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model
+from certbound.checker.statement import Change, Model
 from certbound.errors import CertificateError
 from certbound.problem.model import JUMPS, Node, Tape
 
 MOST_PIECES = 1000
+NEAR = Fraction(1, 2**48)
+"""Share of the horizon by which a jump may miss the end of its piece."""
+_MOST_BREAKS = 40  # about one end
 _LARGEST, _LONGEST = 2**53, 4096  # a value of floor that is a float itself, and bits of a fraction
 _CHOICE = "if_else_zero"
 _OF_TRUTHS = frozenset(["and", "or", "not", _CHOICE])
@@ -38,30 +41,85 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
     fixed = not model.continuous or model.plan is not None or model.hold is not None
     if fixed or math.isinf(model.horizon) or not 1 <= count <= MOST_PIECES:
         raise CertificateError("`proof.jumps` must be left out: time is discrete or endless, inputs are held, or many.")
-    tape, horizon = model.dynamics, _decimal(model.horizon)
+    tape, horizon = model.dynamics, Fraction(model.horizon)
     timed = _timed(tape)
-    ends = [horizon * k / count for k in range(count + 1)]
-    found: dict[int, list[float | None]] = {index: [] for index in timed if tape.nodes[index].op in JUMPS | _BENDS}
-    for first, last in pairwise(ends):
+    jumps = [index for index in timed if tape.nodes[index].op in JUMPS | _BENDS]
+    ends, near = [horizon * k / count for k in range(count + 1)], horizon * NEAR
+    inside, about = [], []
+    for k, end in enumerate(ends):
         budget.check()
-        lines: dict[int, Ends | None] = {}
-        for index in timed:
-            lines[index] = _short(_line(tape.nodes[index], lines, first, last))
-            node = tape.nodes[index]
-            if node.op in _BENDS:
-                found[index].append(_side(node, [lines[arg] for arg in node.args]))
-            elif index in found:
-                value = lines[index]
-                found[index].append(float(value[0]) if value is not None and value[0] == value[1] else None)
-    values = {
-        index: [value for value in row if value is not None]
-        for index, row in found.items() if None not in row and tape.nodes[index].op != _CHOICE
-    }  # fmt: skip
-    return _replaced(model, values, count)
+        about.append(_about(tape, timed, max(end - near, Fraction(0)), min(end + near, horizon), budget))
+        if k < count:
+            inside.append(_values(tape, timed, end + near, ends[k + 1] - near)[0])
+    courses = {}
+    for index in jumps:
+        rows = tuple(tuple(row[index] for row in own) for _, own in about)
+        course = _Course(tuple(row[index] for row in inside), rows)
+        if course.known and tape.nodes[index].op != _CHOICE:
+            courses[index] = course
+    return _replaced(model, courses, ends, [breaks for breaks, _ in about])
 
 
-def _decimal(value: float) -> Fraction:
-    return Fraction(repr(value))
+class _Course(NamedTuple):
+    """The values of a jump: inside of every piece, and from break to break about every end of one; None: unknown."""
+
+    inside: tuple[float | None, ...]
+    about: tuple[tuple[float | None, ...], ...]
+
+    @property
+    def known(self) -> bool:
+        """Whether all are."""
+        return None not in self.inside and not any(None in row for row in self.about)
+
+    @property
+    def changes(self) -> bool:
+        """Whether they differ."""
+        return len({*self.inside, *(value for row in self.about for value in row)}) > 1
+
+
+def _about(
+    tape: Tape, timed: Sequence[int], first: Fraction, last: Fraction, budget: Budget
+) -> tuple[list[Fraction], list[dict[int, float | None]]]:
+    """Times about the end of a piece at which something jumps or bends, and the values from one to the next."""
+    breaks, place = [first, last], 0
+    rows: list[dict[int, float | None]] = []
+    while place + 1 < len(breaks):
+        budget.check()
+        values, jump = _values(tape, timed, *breaks[place : place + 2])
+        if jump is None or len(breaks) > _MOST_BREAKS:
+            rows.append(values)
+            place += 1
+        else:
+            breaks.insert(place + 1, jump)
+    return breaks[1:-1], rows
+
+
+def _values(
+    tape: Tape, timed: Sequence[int], first: Fraction, last: Fraction
+) -> tuple[dict[int, float | None], Fraction | None]:
+    """What jumps and sides of bends are between two times, None where unknown; and a time inside at which one jumps."""
+    lines: dict[int, Ends | None] = {}
+    values: dict[int, float | None] = {}
+    jump = None
+    for index in timed:
+        node = tape.nodes[index]
+        line = lines[index] = _short(_line(node, lines, first, last))
+        if node.op in _BENDS:
+            values[index] = _side(node, [lines[arg] for arg in node.args])
+        elif node.op in JUMPS:
+            values[index] = float(line[0]) if line is not None and line[0] == line[1] else None
+        given = [lines[arg] for arg in node.args] if node.op in JUMPS | _BENDS else [None]
+        if jump is None and values.get(index) is None and node.op not in _OF_TRUTHS and None not in given:
+            jump = _crossing(node.op, [line for line in given if line is not None], first, last)
+    return values, jump
+
+
+def _crossing(op: str, given: Sequence[Ends], first: Fraction, last: Fraction) -> Fraction | None:
+    """A time inside at which what jumps or bends crosses 0 (``floor``: a whole number)."""
+    start, end = (a - b for a, b in zip(*given)) if len(given) == 2 else given[0]
+    level = Fraction(math.floor(min(start, end)) + 1) if op == "floor" else Fraction(0)
+    crossed = min(start, end) < level < max(start, end)
+    return first + (last - first) * (level - start) / (end - start) if crossed else None
 
 
 def _timed(tape: Tape) -> list[int]:
@@ -75,7 +133,7 @@ def _timed(tape: Tape) -> list[int]:
 def _line(node: Node, lines: Mapping[int, Ends | None], first: Fraction, last: Fraction) -> Ends | None:
     """An operation inside a piece, where it is one straight line; None elsewhere."""
     if node.op == "const":
-        return _decimal(node.value), _decimal(node.value)
+        return Fraction(node.value), Fraction(node.value)
     if node.op == "input":
         return first, last
     given = [line for line in (lines[arg] for arg in node.args) if line is not None]
@@ -150,10 +208,12 @@ def _step(op: str, given: Sequence[Ends]) -> Ends | None:
     return truth, truth
 
 
-def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -> Model:
+def _replaced(
+    model: Model, values: Mapping[int, _Course], ends: Sequence[Fraction], breaks: Sequence[Sequence[Fraction]]
+) -> Model:
     """The model with jumps as constants, or as inputs behind the states; a bend is one side, or each by its inputs."""
-    tape, first = model.dynamics, 1 + model.dimension
-    rows = list(dict.fromkeys(tuple(row) for row in values.values() if count == 1 or len(set(row)) > 1))
+    tape, first, count = model.dynamics, 1 + model.dimension, len(ends) - 1
+    rows = list(dict.fromkeys(course for course in values.values() if count == 1 or course.changes))
     if not rows:
         raise Unproved(f"time alone decides no jump of the dynamics at the ends of {count} pieces")
     nodes: list[Node] = []
@@ -164,20 +224,20 @@ def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -
         return len(nodes) - 1
 
     for index, node in enumerate(tape.nodes):
-        row = tuple(values.get(index, ()))
+        row = values.get(index)
         args = () if node.op == "input" else tuple(place[arg] for arg in node.args)
-        if row and node.op in _BENDS:
+        if row is not None and node.op in _BENDS:
             other = args[1] if len(args) == 2 else put("neg", args)
             if row in rows:
                 side = put("input", (first + rows.index(row),))
                 rest = put("mul", (put("sub", (put("const", (), 1.0), side)), other))
                 place.append(put("add", (put("mul", (side, args[0])), rest)))
             else:
-                place.append(args[0] if row[0] else other)
-        elif row in rows:
+                place.append(args[0] if row.inside[0] else other)
+        elif row is not None and row in rows:
             place.append(put("input", (first + rows.index(row),)))
-        elif row:
-            place.append(put("const", (), row[0]))
+        elif row is not None:
+            place.append(put("const", (), row.inside[0]))
         elif node.op == _CHOICE and node.args[0] in values and tape.nodes[node.args[0]].op in _TRUTHS:
             place.append(put("mul", args))  # by 0 or 1
         elif node.op == "input":
@@ -187,8 +247,23 @@ def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -
     names = (*tape.inputs[:first], *(f"jump {k + 1}" for k in range(len(rows))), *tape.inputs[first:])
     outputs = tuple(place[output] for output in tape.outputs)
     new = Tape(inputs=names, nodes=tuple(nodes), outputs=outputs, shape=tape.shape)
-    plan = [[row[k] for row in rows] for k in range(count)]
-    return replace(model, dynamics=new, plan=plan)
+    plan = [[_known(row.inside[k]) for row in rows] for k in range(count)]
+    changes = [_change(k, ends, breaks[k], rows) for k in range(count + 1)]
+    return replace(model, dynamics=new, plan=plan, changes=changes)
+
+
+def _change(k: int, ends: Sequence[Fraction], breaks: Sequence[Fraction], rows: Sequence[_Course]) -> Change:
+    """What happens about the end ``k`` of a piece; before 0 and after the horizon there is nothing."""
+    times = list(breaks) or [ends[k]]
+    if breaks and k in (0, len(ends) - 1):
+        times = [ends[0], *times] if k == 0 else [*times, ends[-1]]
+    columns = [[_known(value) for value in row.about[k]] for row in rows]
+    return Change(times[0], times[-1], [min(column) for column in columns], [max(column) for column in columns])
+
+
+def _known(value: float | None) -> float:
+    assert value is not None
+    return value
 
 
 def jumps_of(proof: object) -> tuple[int | None, object]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Sequence
 
 __all__ = ["main"]
@@ -16,13 +17,17 @@ EARLY = "certbound: interrupted\n  why: it had not begun yet; nothing was writte
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and leave with its exit code."""
+    """Run one command and leave with its exit code.
+
+    Limits of time count from where the process began, if the command is that of its own command line.
+    """
+    began = time.perf_counter() - time.process_time() if arguments is None else None  # so far it has only worked
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # before NumPy is loaded; see `certbound.parallel.alone`
         os.environ.setdefault(name, "1")
     try:
         from certbound.cli.app import run
 
-        code = run(arguments)
+        code = run(arguments, began=began)
     except KeyboardInterrupt:  # before the command had begun
         sys.stderr.write(EARLY)
         code = 130

@@ -10,6 +10,7 @@ import logging
 import re
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
@@ -68,15 +69,21 @@ for _module in (verify, sweep, derive, tune, synthesize, simulate, exit_times, c
     app.command(_name.replace("_", "-"), epilog=_module.EXAMPLES)(getattr(_module, _name))
 
 
-def run(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code; ``--verbose`` and ``--quiet`` may stand anywhere."""
+def run(arguments: Sequence[str] | None = None, *, began: float | None = None) -> int:
+    """Run one command and return its exit code; ``--verbose`` and ``--quiet`` may stand anywhere.
+
+    Limits of time count from ``began``, a time of ``time.perf_counter``; from now when omitted.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     SETTINGS.verbose, SETTINGS.quiet, SETTINGS.json = ("--verbose" in words, "--quiet" in words, "--json" in words)
-    SETTINGS.answered = False
+    SETTINGS.answered, SETTINGS.began = False, time.perf_counter() if began is None else began
     words = [word for word in words if word not in ("--verbose", "--quiet")]
     command = next((word for word in words if not word.startswith("-")), "")
-    with logging_to_stderr(verbose=SETTINGS.verbose):
-        return _run(words, command)
+    try:
+        with logging_to_stderr(verbose=SETTINGS.verbose):
+            return _run(words, command)
+    finally:
+        SETTINGS.began = None
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from certbound.cli.options import number, option
+from certbound.cli.output import SETTINGS
 from certbound.watch import OutOfTime, Progress, Watch
 
 
@@ -39,11 +40,14 @@ VerdictLimitOption = Annotated[
 
 
 class Clock:
-    """Time that is left of a limit (None is no limit), and who hears of progress."""
+    """Time that is left of a limit (None is no limit), and who hears of progress.
+
+    It counts from where the command began: to load the program and to read the problem take time as well.
+    """
 
     def __init__(self, limit: float | None, tell: Callable[[Progress], object] | None = None) -> None:
         self.limit = limit
-        self.started = time.perf_counter()
+        self.started = time.perf_counter() if SETTINGS.began is None else SETTINGS.began
         self._tell = tell
 
     @property

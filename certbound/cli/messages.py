@@ -6,10 +6,13 @@ import contextlib
 import linecache
 import re
 import sys
+import sysconfig
 from collections.abc import Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from certbound.display import one_line
 from certbound.errors import (
     CertboundError,
     CertificateError,
@@ -151,8 +154,8 @@ def for_files(text: str) -> str:
 
 
 def write_error(what: str, why: str, cure: str) -> None:
-    """Three lines on standard error."""
-    sys.stderr.write(f"certbound: {what}\n  why: {why}\n  try: {cure}\n")
+    """Three lines on standard error, whatever the texts hold."""
+    sys.stderr.write(f"certbound: {one_line(what)}\n  why: {one_line(why)}\n  try: {one_line(cure)}\n")
     sys.stderr.flush()
 
 
@@ -170,6 +173,25 @@ def _install_hint(module: str) -> str:
 
 def _one_line(message: str) -> str:
     return " ".join(message.split())
+
+
+def place_in_module(error: Exception) -> str:
+    """Where a user's module raised an error, in words to add; empty where it did not, or certbound refused its input.
+
+    The place is the innermost line of the traceback in a file that is not installed, or in any that is not certbound's.
+    """
+    if _refused(error):
+        return ""
+    installed = tuple(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib"))
+    own, other, trace = "", "", error.__traceback__
+    while trace is not None:
+        file = trace.tb_frame.f_code.co_filename
+        module = str(trace.tb_frame.f_globals.get("__name__", "")).split(".")[0]
+        if module not in ("certbound", "importlib") and not file.startswith("<"):
+            other = f" in line {trace.tb_lineno} of {Path(file).name}"
+            own = own if file.startswith(installed) else other
+        trace = trace.tb_next
+    return own or other
 
 
 def _refused(error: Exception) -> bool:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certbound.cli.messages import InputError, for_files, split_cure
+from certbound.cli.messages import InputError, for_files, place_in_module, split_cure
 from certbound.cli.output import SETTINGS
 
 if TYPE_CHECKING:
@@ -179,12 +179,23 @@ def _as_input_error(cure: str, *, module: bool = False) -> Iterator[None]:
     except (InputError, SyntaxError):
         raise
     except (ValueError, TypeError, ArithmeticError) as error:
+        if module and (place := place_in_module(error)):
+            raise InputError(_raised(error, place), cure) from error
         why, own = split_cure(for_files(str(error)) if not module else str(error))
         raise InputError(why.replace("`source`", "`PROBLEM`"), own or _about(why, cure)) from error
     except Exception as error:  # a user's module may raise anything; what is ours is raised again
         if not module:
             raise
-        raise InputError(f"the module raised {type(error).__name__}: {' '.join(str(error).split())}", cure) from error
+        raise InputError(_raised(error, place_in_module(error)), cure) from error
+    except SystemExit as error:  # its code would be taken for an answer
+        if not module:
+            raise
+        raise InputError("the module ended the program", "leave `sys.exit()` out where it is imported") from error
+
+
+def _raised(error: Exception, place: str) -> str:
+    """That the user's own module raised an error, and where."""
+    return f"the module raised {type(error).__name__}{place}: {' '.join(str(error).split())}"
 
 
 def _about(why: str, cure: str) -> str:

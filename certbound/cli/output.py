@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from certbound.display import plain
+from certbound.display import one_line, plain
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,18 +32,20 @@ class Settings:
     json: bool = False
     answered: bool = False
     """Whether the one JSON object of ``--json`` has been printed."""
+    began: float | None = None
+    """Since when limits of time count, by ``time.perf_counter``; None between commands."""
 
 
 SETTINGS = Settings()
 
 
 def console() -> Console:
-    """Standard output for people: colours and box drawing on a terminal only."""
+    """Standard output for people: colours and box drawing on a terminal only; a text is printed as it is."""
     from rich.console import Console
 
     terminal = sys.stdout.isatty()
     width = None if terminal else max(100, int(os.environ.get("COLUMNS") or 100))
-    return Console(file=sys.stdout, highlight=False, soft_wrap=not terminal, width=width)
+    return Console(file=sys.stdout, highlight=False, emoji=False, soft_wrap=not terminal, width=width)
 
 
 def show(result: Mapping[str, Any], as_json: bool, in_words: Callable[[], None]) -> None:
@@ -87,7 +89,7 @@ def spinner(text: str) -> Iterator[Callable[[str], None]]:
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(text, total=None)
         yield lambda text: progress.update(task, description=text)
@@ -100,7 +102,7 @@ def _lines(text: str) -> Iterator[Callable[[str], None]]:
 
     def tell() -> None:
         while not over.wait(EVERY):
-            sys.stderr.write(f"{said[-1]}, {time.monotonic() - begun:.0f} s\n")
+            sys.stderr.write(f"{one_line(said[-1])}, {time.monotonic() - begun:.0f} s\n")
             sys.stderr.flush()
 
     thread = threading.Thread(target=tell, daemon=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.problem.model import Tape
+from certbound.problem.model import Change, Tape
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System, from_control
@@ -79,7 +80,18 @@ class Model:
         assert self.problem is not None
         length = float(self.problem.horizon) / len(plan)
         first, last = int(np.floor(start / length - 1e-9)), int(np.ceil(end / length + 1e-9))
-        return plan[max(first, 0) : max(last, 1)]
+        rows = plan[max(first, 0) : max(last, 1)]
+        changes = self.problem.changes
+        if changes is None:
+            return rows
+        near = changes[max(first, 0) : max(last, 1) + 1]
+        return _with_changes(rows, [one for one in near if one.first <= end and one.last >= start])
+
+
+def _with_changes(rows: Array, changes: Sequence[Change]) -> Array:
+    """The rows and what inputs may be where they change."""
+    beside = [[*end, *rows[0, len(end) :]] for one in changes for end in (one.low, one.high)]
+    return np.array([*rows, *beside])
 
 
 def model_of(source: Any, domain: Any, horizon: float | None) -> Model:
@@ -103,7 +115,8 @@ def model_of(source: Any, domain: Any, horizon: float | None) -> Model:
     if problem is not None and (problem.plan is not None or system.inputs is None):
         dynamics = problem.closed_loop
         plan = problem.input_sequence
-        input_box = None if plan is None else Box(plan.min(axis=0), plan.max(axis=0))
+        rows = None if plan is None else _with_changes(plan, problem.changes or ())
+        input_box = None if rows is None else Box(rows.min(axis=0), rows.max(axis=0))
     lows, highs = [np.zeros(1), low], [np.full(1, np.inf if horizon is None else horizon), high]
     for box in (input_box, system.disturbance):
         if box is not None:

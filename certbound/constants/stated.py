@@ -8,7 +8,9 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.constants.bounds import bound_constants
+from certbound.constants.enclosures import enclose
 from certbound.constants.matching import implies
+from certbound.constants.model_data import model_of
 from certbound.display import rounded
 from certbound.errors import CertboundError
 from certbound.problem.model import Tape, compile_numpy, jacobian
@@ -39,6 +41,20 @@ def refuse_contradiction(problem: Problem, constants: Constants) -> None:
     _check_noise(constants, sigma, metric @ _covariance(system, point))
     if problem.system.inputs is None or problem.plan is not None:
         _check_jacobian(problem, constants, metric, point)
+
+
+def refuse_jumps(problem: Problem) -> None:
+    """Refuse a model that jumps or is undefined somewhere on its domain (or all of R^n), with an EnclosureError.
+
+    No slope bounds how far two values are apart there, whatever constants are stated; those that are proved are refused
+    the same box.
+    """
+    model = model_of(problem, None, None)
+    ranges = [model.ranges[slot] for slot in range(len(model.dynamics.inputs))]
+    enclose(model.dynamics, ranges)
+    system = problem.system
+    if isinstance(system, ContinuousSystem) and isinstance(system.diffusion, Tape):
+        enclose(system.diffusion, ranges[: 1 + system.dimension])
 
 
 def proved_or_stated(problem: Problem, constants: Constants) -> Constants:

@@ -17,6 +17,7 @@ from certbound.problem.systems import System
 
 _LONGEST_UNIT = 20
 _SHORTEST, _LONGEST = 1e-50, 1e50  # horizons in continuous time: their fifth powers are floats
+_ROUNDED = Fraction(1, 2**51)  # share of the horizon by which two floats of decimal numbers may miss each other
 _MOST_SAMPLES = 1000
 
 
@@ -68,9 +69,13 @@ def checked_hold(value: Any, plan: Any, system: System, horizon: float) -> float
 
 
 def samples_of(hold: float, horizon: float) -> int | None:
-    """How often ``hold`` fits into the horizon, both as the decimal numbers that they are written as; None if not."""
-    found = Fraction(repr(float(horizon))) / Fraction(repr(float(hold)))
-    return int(found) if found.denominator == 1 else None
+    """How often ``hold`` fits into the horizon, up to rounding; None if not.
+
+    The samples are at the ends of as many equal parts of the horizon.
+    """
+    count = round(horizon / hold)
+    missed = abs(count * Fraction(hold) - Fraction(horizon))
+    return count if count and missed <= _ROUNDED * Fraction(horizon) else None
 
 
 def check_dimension(name: str, region: Any, dimension: int) -> None:

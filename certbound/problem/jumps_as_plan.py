@@ -13,6 +13,8 @@ from certbound.problem.systems import ContinuousSystem
 def in_pieces(problem: Problem) -> Problem:
     """The same problem with the jumps that t alone decides as a plan of equal pieces; itself where there are none.
 
+    Where a jump misses the end of its piece by rounding, the problem's ``changes`` say so.
+
     Jumps in continuous time only: in discrete time t is a whole number, and everything is decided. A problem with a
     plan that is an array already has pieces of its own, and is left as it is.
 
@@ -36,8 +38,9 @@ def in_pieces(problem: Problem) -> Problem:
     if found is None:
         return problem
     rows = np.array(found.rows)
+    low, high = (np.array([getattr(change, end) for change in found.changes]) for end in ("low", "high"))
     cut = ContinuousSystem(
-        found.tape, states=system.states, inputs=Box(rows.min(axis=0), rows.max(axis=0)), input_names=found.names,
+        found.tape, states=system.states, inputs=Box(low.min(axis=0), high.max(axis=0)), input_names=found.names,
         disturbance=system.disturbance, disturbance_names=system.disturbance_names or None, diffusion=system.diffusion,
     )
-    return problem.replace(system=cut, plan=rows, cost=None)
+    return problem.replace(system=cut, plan=rows, cost=None, changes=found.changes)

@@ -12,7 +12,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.checks import assign, nearest
-from certbound.display import Shown, amount, ask_later_room, name_text
+from certbound.display import Shown, amount, ask_later_room, name_text, unit_text
 from certbound.errors import InfeasibleError
 from certbound.problem.ingredients import (
     check_dimension,
@@ -28,7 +28,7 @@ from certbound.problem.ingredients import (
     described,
     samples_of,
 )
-from certbound.problem.model import Tape, substitute, trace
+from certbound.problem.model import Tape, rounded_comparison, substitute, trace
 from certbound.problem.sets import (
     Box,
     GaussianStart,
@@ -42,6 +42,7 @@ from certbound.problem.sets import (
 )
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
+MOST_STEPS = 2**20  # after which comparisons are not looked at
 DOMAIN = "the model's domain"
 """Label of the constraint to stay in it."""
 
@@ -89,6 +90,9 @@ class Problem(Shown):
         For humans.
     parameters : mapping, optional
         Parameters that the problem was built with, for the record.
+    changes : sequence of Change, optional
+        When the rows of an array plan change, where that is not just at the ends of equal pieces (CT): one entry for
+        0, for every end between two pieces, and for the horizon. For problems that are made of others.
     source : mapping, optional
         The content of the problem file it came from, for saving it as written; dropped by ``replace``.
 
@@ -124,6 +128,7 @@ class Problem(Shown):
     units: Any = field(default=None, kw_only=True)
     name: str = field(default="problem", kw_only=True)
     parameters: Any = field(default=None, kw_only=True)
+    changes: Any = field(default=None, kw_only=True, repr=False)
     source: Any = field(default=None, kw_only=True, repr=False)
     _closed_loop: Tape | None = field(default=None, init=False, repr=False)
 
@@ -152,6 +157,7 @@ class Problem(Shown):
             check_target(self.reach.region, self.kept, self.system.dimension)
         if self.hold is None and (self.plan is not None or self.system.inputs is None):
             assign(self, _closed_loop=self._closed())
+        self._refuse_rounding()
 
     @property
     def constraints(self) -> tuple[Inside, ...]:
@@ -185,9 +191,9 @@ class Problem(Shown):
 
     @property
     def time_unit(self) -> str:
-        """The unit of time: ``s`` or ``steps``, unless another one is given."""
+        """The unit of time as sentences name it: ``s`` or ``steps``, unless another one is given."""
         usual = "s" if self.system.time == "continuous" else "steps"
-        return str(self.units.get("time", usual))
+        return unit_text(str(self.units.get("time", usual)))
 
     @property
     def time_axis(self) -> str:
@@ -304,9 +310,30 @@ class Problem(Shown):
                 "`horizon` must not change alone when the plan is an array over it; give `plan=` as well."
             )
         values = {name: getattr(self, name) for name in known}
+        if "horizon" in changes and "changes" not in changes:
+            values["changes"] = None
         if "system" in changes and "cost" not in changes and changes["system"].inputs is None:
             values["cost"] = None
         return Problem(**(values | changes))
+
+    def _refuse_rounding(self) -> None:
+        """Refuse comparisons of which a program that rounds takes another side than exact arithmetic does."""
+        steps = int(min(self.horizon, MOST_STEPS)) if self.system.time == "discrete" else 0
+        noise = self.system.diffusion if isinstance(self.system, ContinuousSystem) else self.system.gain
+        when = "a step" if steps else "some time"
+        given = [(self._closed_loop or self.system.dynamics, steps, when), (noise, steps, when)]
+        if self.hold is not None:
+            given.append((self.plan, self.samples, "a sampling time"))
+        sets = [constraint.region for constraint in (*self.safe, *([self.reach] if self.reach is not None else []))]
+        given += [(getattr(region, "center", None), steps, when) for region in sets]
+        for tape, samples, when in given:
+            found = rounded_comparison(tape, float(steps or self.horizon), samples) if isinstance(tape, Tape) else None
+            if found is not None:
+                raise ValueError(
+                    f"the model must not hold a comparison that rounding decides, got {found}: a program takes another "
+                    f"side of it at {when} than exact arithmetic does. Compare with one number (t < 0.3, not "
+                    "t - 0.1 < 0.2), away from steps and sampling times (t < 8.5, not 0.1*t <= 0.9)."
+                )
 
     def _constraints(self) -> tuple[Inside, ...]:
         safe = [self.safe] if isinstance(self.safe, Inside) else self.safe

@@ -76,7 +76,7 @@ def decide(
         with search.watch.running():
             violation = search.violation()
             if violation is not None and not search.arrives_by_noise(names):
-                return unsafe(problem, violation)
+                return unsafe(problem, violation, method)
             if method == "auto":
                 search.first_pass(names)
             else:

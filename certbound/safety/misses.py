@@ -46,13 +46,14 @@ def best_time(problem: Problem) -> float:
 
 def _at_sample(problem: Problem) -> float:
     """The sampling time at which trajectories under inputs that follow at once are deepest in the target."""
-    step, (first, last) = Fraction(repr(problem.hold)), (Fraction(repr(end)) for end in window_of(problem))
+    step, (first, last) = Fraction(problem.horizon) / problem.samples, map(Fraction, window_of(problem))
     samples = [number * step for number in range(max(1, math.ceil(first / step)), math.floor(last / step) + 1)]
-    found = [float(time) for time in samples if Fraction(repr(float(time))) == time]
+    found = [float(time) for time in samples if Fraction(float(time)) == time]
     if not found:
         raise EngineError(
             f"the target counts from {float(first):g} to {float(last):g}, when no inputs are computed, which are held "
-            f"for {problem.hold:g}; let its `during` hold a multiple of that."
+            f"for {problem.hold:g}, at a time that is exactly a float; let its `during` hold a multiple of that which "
+            "is one, such as the horizon."
         )
     times, _, _, paths, flow = _followed(problem.replace(hold=None))
     depth = rooms(Inside(problem.reach.region, (0.0, times[-1])), flow, times, paths).min(axis=0)

@@ -319,7 +319,8 @@ def _sentence(text: str) -> str:
     return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
 
-def unsafe(problem: Problem, violation: Violation) -> Verdict:
+def unsafe(problem: Problem, violation: Violation, method: str = "auto") -> Verdict:
+    """UNSAFE_NOMINAL by a trajectory without noise, which is looked for before any method is asked."""
     when = f"t = {violation.time:.4g}" if problem.system.time == "continuous" else f"step {violation.time:g}"
     start = ", ".join(f"{value:.4g}" for value in violation.start)
     what = f"breaks '{violation.constraint.label}' at {when}, by {violation.depth:.3g}"
@@ -336,7 +337,7 @@ def unsafe(problem: Problem, violation: Violation) -> Verdict:
         reason=(
             f"without any noise the trajectory from ({start}) {what} (proved by intervals)."
         ),
-        method="noise-free trajectory",
+        method="noise-free trajectory" if method == "auto" else f"noise-free trajectory, looked for before {method}",
         reach=violation.reach,
         problem=problem,
     )

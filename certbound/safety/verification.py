@@ -24,6 +24,7 @@ def verify_safety(
     problem: Problem, method: str = "auto", cells: int | None = None, *, constants: Constants | None = None,
     time_limit: float | None = None, progress: Callable[[Progress], object] | None = None, smallest: bool = False,
     explain: bool = False, jobs: int = 1, executor: Any = None, patient: bool = True,
+    started: float | None = None,
 ) -> Verdict:
     """Prove that a problem's constraints are broken with probability at most delta, or say why not.
 
@@ -59,6 +60,8 @@ def verify_safety(
     patient : bool
         Whether what is left of ``time_limit`` is spent where nothing is SAFE, on engines whose bounds go on falling; if
         not, the search ends where more time would hardly change the verdict.
+    started : float, optional
+        Time of ``time.perf_counter`` from which ``time_limit`` counts; that of the call when omitted.
 
     Returns
     -------
@@ -82,7 +85,7 @@ def verify_safety(
     """
     instance("problem", problem, Problem)
     own = time_limit is not None or progress is not None or jobs != 1 or executor is not None
-    made = Watch(time_limit, progress=progress, jobs=jobs, executor=executor, patient=patient)
+    made = Watch(time_limit, progress=progress, jobs=jobs, executor=executor, patient=patient, started=started)
     watch = made if own else current_watch() or made
     verdict = decide(problem, method=method, cells=cells, constants=constants, watch=watch)
     with contextlib.suppress(OutOfTime), watch.running():

@@ -151,7 +151,8 @@ def tables_of(barriers: Sequence[Barrier]) -> dict[str, Any]:
 
 def _round_fields(form: Quadratic, embed: Array, centers: Array) -> dict[str, Any]:
     """A ball or ellipsoid as ‖matrix x - offset‖ <= radius; an interval, in one dimension, as two faces."""
-    matrix, offset, radius = form.root @ embed, centers @ form.root.T, float(form.radius)
+    root, radius = form.test
+    matrix, offset = root @ embed, centers @ root.T
     if form.dimension == 1:
         both = np.concatenate([radius + offset, radius - offset], axis=-1)
         return {"round": False, "matrix": np.vstack([matrix, -matrix]), "offset": both}
@@ -294,7 +295,7 @@ def _bridge_avoid(
         lines += [f"elif {g} > 0.0:", f"    enter = max(enter, {g} / ({g} - {n}))"]
         lines += [f"elif {n} > 0.0:", f"    leave = min(leave, {g} / ({g} - {n}))"]
     lines += ["if worst >= 0.0:", *indent(_touch("worst", number))]
-    lines += ["elif enter < leave:", f"    left = {number}"]
+    lines += ["elif enter <= leave:", f"    left = {number}"]
     return [if_all(near, "left < 0", *active), *indent(lines)]
 
 

@@ -42,14 +42,12 @@ from certbound.synthesis.tightening import (
     spread_tube,
     tighten,
 )
-from certbound.synthesis.transcription import Mode, Solution, Transcription
+from certbound.synthesis.transcription import ROUNDING, Mode, Solution, Transcription
 from certbound.tubes.constants import Constants
 from certbound.tubes.tube import Tube
 from certbound.tubes.tuning import tune_tube
 
 PIECES = 40
-ROUNDING = 1e-7
-"""Taken from the input bounds at step 0, where nothing else is: a proof needs some room."""
 SUBSTEPS = 2
 FITTED = ("kummer", "bessel")
 """Tubes that are fitted to the room of the plan."""
@@ -118,6 +116,8 @@ class Planner:
         self.grid = _grid(problem, steps)
         self.start = problem.initial.middle
         self.feedback = None if feedback is None else resolve_feedback(problem, feedback, self.start)
+        if self.feedback is not None:
+            self._check_start(self.feedback)
         self.system = system if self.feedback is None else close_loop(system, self.feedback)
         self.plant = _plant(problem, self.system.dynamics, self.feedback)
         self.faces: tuple[Face, ...] = faces_of(problem)
@@ -181,6 +181,18 @@ class Planner:
         if initial.random:
             return np.zeros(len(gain))
         return np.asarray(np.maximum(initial.support(gain) - gain @ self.start, 0.0))
+
+    def _check_start(self, gain: Array) -> None:
+        """Refuse a feedback that alone takes more of the first input than there is, over the initial set."""
+        box, moved = self.problem.system.inputs, self._initial_inputs(gain)
+        assert box is not None
+        for name, taken, room in zip(self.problem.system.input_names, moved, (box.high - box.low) / 2):
+            if taken + ROUNDING > room:
+                raise ValueError(
+                    f"`feedback` must leave the first input room: over the initial set K x alone moves {name} by "
+                    f"{taken:.4g} to either side, and its bounds allow {room:.4g}; choose a smaller initial set, or a "
+                    "smaller gain."
+                )
 
     def first_plan(self) -> Solution:
         """The plan with the most room, in standard deviations of the linearised noise."""

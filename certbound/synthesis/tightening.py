@@ -105,10 +105,11 @@ class LinearTube(Tightening):
 
     def _levels(self, rows: Array, key: object) -> Array:
         """Levels of Z along rows (N, R, n): a factor times the standard deviation."""
+        if isinstance(self.events, StepEvents):
+            steps = [self.events.along(rows[:, index]) for index in range(rows.shape[1])]
+            return np.stack([event.capped(self._factor(event) * event.profile) for event in steps], axis=1)
         events = [self.events.along(rows[:, index]) for index in range(rows.shape[1])]
         shapes = np.stack([event.profile for event in events], axis=1)
-        if isinstance(self.events, StepEvents):
-            return np.asarray(shapes * np.array([self._factor(event) for event in events]))
         if key not in self.factors:
             self.factors[key] = self._factor(events[int(np.argmax(shapes.max(axis=0)))])
         return np.asarray(shapes * self.factors[key])

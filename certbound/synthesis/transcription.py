@@ -5,8 +5,9 @@ continuous time a piece is integrated by the classical Runge-Kutta method in ``s
 the constraints are imposed. Three programs over the same variables (h: faces, e: erosions, J: cost):
 
 - ``cost``: min J subject to h >= e;
-- ``scale``: max s subject to h >= s e: how many times larger the tube may be;
-- ``soft``: min J + penalty * xi subject to h >= e - xi, 0 <= xi <= e: xi is reported. The terminal set is softened too.
+- ``scale``: max s subject to h >= s e: how many times larger the tube may be, and what it takes from the inputs;
+- ``soft``: min J + penalty * xi subject to h >= e - xi, 0 <= xi <= e: xi is reported. What is taken from the inputs and
+  the terminal set are softened too; the bounds of the inputs stay hard.
 
 A solver's word counts for nothing here: `Transcription.solve` rolls the inputs out and measures the constraints again.
 """
@@ -35,6 +36,8 @@ END_PENALTY = 10.0
 """Of missing the terminal set in mode ``soft``: the constraints come first."""
 EFFORT = 1e-9
 TOLERANCE = 1e-6
+ROUNDING = 1e-7
+"""Taken from the input bounds where nothing else is: a proof needs some room."""
 LARGEST_SCALE = 1e3
 _UNBOUNDED = 1e19  # what IPOPT takes for infinity
 
@@ -52,6 +55,7 @@ class Solution:
     cost: float
     slack: Array  # (points, faces): by how much each tightened constraint is missed
     pressure: Array  # (points, faces): multipliers of the tightened constraints: where they hold the plan back
+    input_pressure: Array  # (points + 1,): the same of the input bounds that a feedback tightens
     status: str  # the solver's word
     seconds: float
     iterations: int
@@ -86,6 +90,8 @@ class Transcription:
         weights = ca.SX.sym("w", self.weights, grid.points)
         scale = ca.SX.sym("s")
         slack = ca.SX.sym("xi", len(self.faces), grid.points)
+        freed = ca.SX.sym("xi_u", m, grid.points + 1)
+        held = tightening - freed if mode == "soft" else tightening * ca.fmax(scale, 0)
         state, variables = start, []
         dynamics, gaps, choices, inputs_of = [], [], [], []
         total: Any = 0
@@ -94,18 +100,18 @@ class Transcription:
             variables += [u, following]
             now = t0 + k * grid.step
             total += grid.step * self.cost.symbolic(ca, now, state, self._applied(ca, u, state))
-            inputs_of.append(self._input_rows(ca, u, state, tightening[:, k * grid.substeps]))
+            inputs_of.append(self._input_rows(ca, u, state, held[:, k * grid.substeps]))
             points = self.plant.symbolic_step(ca, grid, now, state, u)
             for i, point in enumerate(points):
                 index = k * grid.substeps + i
                 at = now + (i + 1) * grid.step / grid.substeps
                 if i < grid.substeps - 1:
-                    inputs_of.append(self._input_rows(ca, u, point, tightening[:, index + 1]))
+                    inputs_of.append(self._input_rows(ca, u, point, held[:, index + 1]))
                 else:
                     dynamics.append(following - point)
                     point = following
                     if grid.continuous:
-                        inputs_of.append(self._input_rows(ca, u, point, tightening[:, index + 1]))
+                        inputs_of.append(self._input_rows(ca, u, point, held[:, index + 1]))
                 gap, choice = self._gaps(ca, point, at, erosion[:, index] * scale, weights[:, index])
                 gaps.append(gap + (slack[:, index] if mode == "soft" else 0))
                 choices.append(choice)
@@ -121,8 +127,8 @@ class Transcription:
             objective = total
         if mode == "soft":
             objective += PENALTY * (ca.sum1(ca.vec(slack)) + ca.sumsqr(slack))
-            objective += END_PENALTY * ca.sum1(ca.vec(ends))
-            free += [ca.vec(slack), ca.vec(ends)]
+            objective += PENALTY * ca.sum1(ca.vec(freed)) + END_PENALTY * ca.sum1(ca.vec(ends))
+            free += [ca.vec(slack), ca.vec(freed), ca.vec(ends)]
             last = last + ends[:, 0] - ends[:, 1]
         variable = ca.vertcat(*variables, *free)
         constraint = ca.vertcat(*dynamics, *gaps, *choices, *inputs_of, last)
@@ -189,7 +195,7 @@ class Transcription:
         taken = np.zeros((self.grid.points + 1, len(self.plant.low))) if tightening is None else tightening
         if mode not in self._solvers:
             self._solvers[mode] = self._build(mode)
-        lower, upper = self._bounds(mode, erosion)
+        lower, upper = self._bounds(mode, erosion, taken)
         g_lower, g_upper = self._sides(times)
         arguments = {
             "x0": self._variables(mode, guess, states, times, erosion),
@@ -227,7 +233,7 @@ class Transcription:
         n, m = self.plant.dimension, len(self.plant.low)
         return self.grid.steps * (n + m), self.weights * self.grid.points
 
-    def _bounds(self, mode: Mode, erosion: Array) -> tuple[Array, Array]:
+    def _bounds(self, mode: Mode, erosion: Array, taken: Array) -> tuple[Array, Array]:
         n = self.plant.dimension
         weights = self._sizes()[1]
         piece_low = np.concatenate([self.plant.low, np.full(n, -np.inf)])
@@ -239,8 +245,10 @@ class Transcription:
             high.append(np.array([LARGEST_SCALE]))
         elif mode == "soft":
             ends = np.zeros(0 if self.terminal is None else 2 * self.terminal.rows)
-            low += [np.zeros(len(self.faces) * self.grid.points), ends]
-            high += [self._allowed(erosion).ravel(), np.full(ends.size, np.inf)]
+            freed = np.maximum(taken - ROUNDING, 0.0)
+            freed[0] = freed[1] if self.grid.continuous else 0.0  # the rest is what the initial set takes
+            low += [np.zeros(len(self.faces) * self.grid.points), np.zeros(taken.size), ends]
+            high += [self._allowed(erosion).ravel(), freed.ravel(), np.full(ends.size, np.inf)]
         return np.concatenate(low), np.concatenate(high)
 
     def _allowed(self, erosion: Array) -> Array:
@@ -266,7 +274,7 @@ class Transcription:
         return int(finite) * self.grid.steps * (1 + self.grid.substeps - (0 if self.grid.continuous else 1))
 
     def _variables(self, mode: Mode, inputs: Array, states: Array, times: Array, erosion: Array) -> Array:
-        ends = states[self.grid.substeps :: self.grid.substeps]
+        ends, m = states[self.grid.substeps :: self.grid.substeps], len(self.plant.low)
         body = np.concatenate([inputs, ends], axis=1).ravel()
         weights = []
         for face, parts in with_parts(self.faces):
@@ -278,6 +286,7 @@ class Transcription:
             extra.append(np.zeros(1))
         elif mode == "soft":
             extra.append(np.maximum(self.missing(states, times, erosion), 0.0).ravel())
+            extra.append(np.zeros((self.grid.points + 1) * m))
             extra.append(np.zeros(0 if self.terminal is None else 2 * self.terminal.rows))
         return np.concatenate([body, *extra])
 
@@ -298,12 +307,12 @@ class Transcription:
         body, _ = self._sizes()
         inputs = np.clip(values[:body].reshape(self.grid.steps, m + n)[:, :m], self.plant.low, self.plant.high)
         scale = float(values[-1]) if mode == "scale" else 1.0
-        states = self.rollout(start, inputs, time_)
+        inputs, states = self._within_bounds(inputs, self.rollout(start, inputs, time_), time_)
         times = self.grid.times(time_)
         missing = np.nan_to_num(self.missing(states, times, erosion, scale), nan=np.inf)
         worst = float(missing.max(initial=-np.inf))
         kept = bool(np.all(np.isfinite(states)) and worst <= TOLERANCE * (1 + np.abs(states).max(initial=0.0)))
-        kept = kept and self._inputs_kept(inputs, states, taken)
+        kept = kept and self._inputs_kept(inputs, states, taken * max(scale, 0.0))
         kept = kept and (self.terminal is None or self.terminal.room(states[-1]) >= -TOLERANCE)
         first = self.grid.steps * n
         good = bool(stats["success"]) if mode == "soft" else kept
@@ -312,9 +321,39 @@ class Transcription:
             cost=self.cost.total(self.grid, self.plant.feedback, states, inputs, time_),
             slack=np.maximum(missing, 0.0),
             pressure=multipliers[first : first + missing.size].reshape(missing.shape),
+            input_pressure=self._input_pressure(multipliers[first + missing.size :]),
             status=str(stats["return_status"]),
             seconds=time.perf_counter() - began, iterations=int(stats["iter_count"]),
         )  # fmt: skip
+
+    def _within_bounds(self, inputs: Array, states: Array, time_: float) -> tuple[Array, Array]:
+        """A proposal whose own inputs u = w + K z leave their bounds with these cut off at the starts of its pieces."""
+        low, high = self.plant.input_low, self.plant.input_high
+        if self.plant.feedback is None or low is None or high is None or not np.all(np.isfinite(states)):
+            return inputs, states
+        own = self.applied_inputs(inputs, states)[:: self.grid.substeps]
+        if np.all((own >= low) & (own <= high)):
+            return inputs, states
+        inner = np.minimum(ROUNDING, (high - low) / 2)
+        found, state, passed = [], states[0], [states[0]]
+        for k, given in enumerate(inputs):
+            moved = self.plant.feedback @ state
+            found.append(np.clip(given + moved, low + inner, high - inner) - moved)
+            passed += list(self.plant.step(self.grid, time_ + k * self.grid.step, state, found[-1]))
+            state = passed[-1]
+        return np.array(found), np.array(passed)
+
+    def _input_pressure(self, multipliers: Array) -> Array:
+        """Largest multiplier of the input rows at every point, from those behind the gaps."""
+        result, count = np.zeros(self.grid.points + 1), self._input_row_count()
+        if count:
+            unions = sum(1 for face in self.faces if face.weights) * self.grid.points
+            blocks = 1 + self.grid.substeps - (0 if self.grid.continuous else 1)
+            rows = multipliers[unions : unions + count].reshape(self.grid.steps, blocks, -1).max(axis=2)
+            for piece, block in np.ndindex(*rows.shape):
+                point = piece * self.grid.substeps + block
+                result[point] = max(result[point], rows[piece, block])
+        return result
 
     def _inputs_kept(self, inputs: Array, states: Array, taken: Array) -> bool:
         if self.plant.feedback is None:
@@ -324,6 +363,14 @@ class Transcription:
         low, high = self.plant.input_low, self.plant.input_high
         slack = TOLERANCE * (1 + np.abs(own).max(initial=0.0))
         return bool(np.all(own >= low + first - slack) and np.all(own <= high - first + slack))  # type: ignore[operator]
+
+    def inputs_missing(self, inputs: Array, states: Array, taken: Array) -> float:
+        """By how much the plant's own inputs miss their tightened bounds at most; 0 where they keep them."""
+        low, high = self.plant.input_low, self.plant.input_high
+        if self.plant.feedback is None or low is None or high is None:
+            return 0.0
+        own, first = self.applied_inputs(inputs, states), taken[:-1]
+        return float(max(np.max(low + first - own), np.max(own - (high - first)), 0.0))
 
     def applied_inputs(self, inputs: Array, states: Array) -> Array:
         """The plant's own nominal input at the start of every substep, shape (points, m)."""

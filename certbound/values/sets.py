@@ -30,7 +30,8 @@ def respected(
     """
     safe, broken = np.ones(len(boxes), dtype=bool), np.zeros(len(boxes), dtype=bool)
     for constraint in constraints:
-        inside, outside = contains(constraint.region, boxes, step, interiors=interiors)
+        edge = not constraint.without_edge
+        inside, outside = contains(constraint.region, boxes, step, interiors=interiors, edge=edge)
         if constraint.outside:
             inside, outside = outside, inside
         safe &= inside
@@ -38,14 +39,21 @@ def respected(
     return safe, broken
 
 
-def contains(region: Region, boxes: Interval, step: int, *, interiors: bool = False) -> tuple[Mask, Mask]:
-    """Boxes that surely lie in a region, and boxes that surely do not meet it (but for points of their faces)."""
+def contains(
+    region: Region, boxes: Interval, step: int, *, interiors: bool = False, edge: bool = True
+) -> tuple[Mask, Mask]:
+    """Boxes that surely lie in a region, and boxes that surely do not meet it.
+
+    With ``interiors`` only the boxes' interior points count. Without its ``edge`` the region is the interior of a set
+    with flat faces.
+    """
     y = region.relative(boxes[:, region.places(boxes.shape[1])], step)
     match region.form:
         case Faces() as form:
             values = form.values(y)
-            outside = (values.lo >= form.bounds) if interiors else (values.lo > form.bounds)
-            return np.asarray((values.hi <= form.bounds).all(axis=1)), np.asarray(outside.any(axis=1))
+            inside = (values.hi <= form.bounds) if interiors or edge else (values.hi < form.bounds)
+            outside = (values.lo > form.bounds) if edge and not interiors else (values.lo >= form.bounds)
+            return np.asarray(inside.all(axis=1)), np.asarray(outside.any(axis=1))
         case Quadratic() as form if form.even:
             square, limit = sq(y).sum(axis=-1), sq(Interval.point(form.radius))
         case Quadratic() as form:

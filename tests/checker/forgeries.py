@@ -99,6 +99,11 @@ def _bounded() -> cb.Problem:
     return cb.Problem(system, initial=[0.2, 0.1], safe=safe, horizon=3, delta=1e-2)
 
 
+def _long() -> cb.Problem:
+    system = cb.DiscreteSystem(lambda x: 0.95 * x, states=2, noise=cb.Uniform(halfwidth=[0.1, 0.05]))
+    return cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=30, delta=1e-2)
+
+
 def _planned() -> cb.Problem:
     system = cb.ContinuousSystem(
         lambda x, u: [-x[0] + u[0]], states=["x"], inputs=cb.Box([-1], [1]), diffusion=[[0.1]]
@@ -220,7 +225,8 @@ _BASES: dict[str, Callable[[], str]] = {
     "bent": _stated(_bent, "linear"),
     "crossed": _stated(_crossed, "linear"),
     "sampled": _stated(_sampled, "linear"),
-    "bounded steps": _stated(_bounded, "linear"),
+    "bounded steps": _stated(_long, "linear"),
+    "steps within reach": _stated(_bounded, "linear"),
     "straight": lambda: json.dumps(linear()),
     "disturbed": lambda: json.dumps(linear(disturbance=cb.Box([0.0], [0.1]))),
     "contraction": _stated(conftest.contraction, "constants"),
@@ -512,6 +518,18 @@ def _(data: Data) -> None:
 @forges("a level costs what sub-Gaussian noise exceeds it", "bounded steps", "linear/proof.py", "_Cell._leaving", MORE)
 def _(data: Data) -> None:
     data["problem"]["noise"] |= {"law": "bounded", "level": "halfwidth", "independent": False}
+
+
+@forges("only noise of bounded entries has a reach", "steps within reach", "linear/proof.py", "_Cell._drives", MORE)
+def _(data: Data) -> None:
+    data["problem"]["noise"] = {
+        "law": "subgaussian", "level": "std", "values": exact([0.1, 0.05]), "matrix": data["problem"]["noise"]["matrix"]
+    }  # fmt: skip
+
+
+@forges("bounded noise takes all of its reach", "steps within reach", "linear/events.py", "bounded_drives", MORE)
+def _(data: Data) -> None:
+    data["problem"]["noise"]["values"] = exact([0.6, 0.05])
 
 
 @forges("only opposite requirements share a product", "cornered", "linear/families.py", "correlated", MORE)

@@ -190,12 +190,14 @@ def test_polynomials_of_any_degree_and_length_end_soon(tape: Data) -> None:
 
 def test_fractions_of_any_length_end_soon_where_the_clock_decides() -> None:
     data, started = parse(text("switched")), time.process_time()
-    nodes = data["problem"]["dynamics"]["nodes"]
-    for op, size, count in (("mul", 1.1, 40), ("mul", 1e308, 1)):
+    nodes, outputs = data["problem"]["dynamics"]["nodes"], data["problem"]["dynamics"]["outputs"]
+    for op, size, count in (("mul", 1.1, 40), ("mul", 3.0, 40), ("mul", 1e308, 1)):
         first = len(nodes)
         nodes += [["const", exact(size)], *[[op, first + k, first + k] for k in range(count)]]
-        nodes.append(["floor", len(nodes) - 1])
-    assert check_data(data).valid
+        nodes += [["floor", len(nodes) - 1], ["add", outputs[0], len(nodes)]]
+        outputs[0] = len(nodes) - 1
+    with pytest.raises(CertificateError, match="rounding decides"):
+        check_data(data)
     assert time.process_time() - started < 2
 
 

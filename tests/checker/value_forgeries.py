@@ -439,8 +439,8 @@ def _(data: Data) -> None:
 def _(data: Data) -> None:
     nodes = data["problem"]["noise"]["diffusion"]["nodes"]
     product = next(node for node in nodes if node[0] == "mul")
-    product[1:] = [max(product[1:])] * 2
-    product[1:] = [nodes.index(["input", 1])] * 2
+    for place in product[1:]:
+        nodes[place] = ["input", 1]
 
 
 @forges("quadratic bounds need a smooth model", "squared", _FLOW, "Flow._refuse", "does not treat")

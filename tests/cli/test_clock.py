@@ -20,6 +20,7 @@ import pytest
 from certbound.cli import main
 from certbound.cli.app import run
 from certbound.cli.clock import Clock
+from certbound.cli.output import SETTINGS
 from certbound.safety.portfolio import ENGINES
 from certbound.watch import OutOfTime, Watch, poll
 
@@ -56,6 +57,45 @@ def test_a_clock_stops_the_work_and_leaves_no_timer() -> None:
     assert signal.getsignal(signal.SIGALRM) is before
     with Clock(None).running():
         assert Clock(None).left == float("inf")
+
+
+def test_a_limit_counts_from_where_the_command_began(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To load the program and to read the problem is part of what somebody waits for."""
+    assert Clock(60.0).left > 0
+    monkeypatch.setattr(SETTINGS, "began", time.perf_counter() - 100.0)
+    assert Clock(60.0).left < 0
+    monkeypatch.undo()
+    words = ["verify", "ou", "--method", "values", "--time-limit", "60"]
+    assert run([*words, "--json"], began=time.perf_counter() - 100.0) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["status"] == "UNKNOWN"
+    assert "The search was stopped after 60 s." in found["reason"]
+    assert SETTINGS.began is None
+    assert run([*words[:2], "--method", "kummer", "--json"]) == 0
+
+
+def test_the_process_itself_began_before_the_command() -> None:
+    """What a process did before the command, here some work, counts where the command is its own."""
+    script = (
+        "import sys, time\n"
+        "while time.process_time() < 0.5: pass\n"
+        "import certbound.cli.app as app\n"
+        "app.run = lambda arguments, began: sys.exit(7 if time.perf_counter() - began >= 0.5 else 1)\n"
+        "from certbound.cli import main\n"
+        "main()\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False, timeout=300).returncode == 7
+
+
+def test_no_paths_are_simulated_when_the_time_is_over(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("certbound.simulation.estimates.simulate_exits", lambda *given, **options: pytest.fail("asked"))
+    words = ["verify", "ou", "--method", "values", "--time-limit", "60"]
+    assert run(words, began=time.perf_counter() - 100.0) == 1
+    assert "simulated" not in capsys.readouterr().out
 
 
 def test_a_limit_waits_for_a_module_that_is_being_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +233,7 @@ def test_as_many_paths_are_simulated_as_fit(
     assert run([*words, "--paths", "10"]) == 0  # compiles
     capsys.readouterr()
     started = time.perf_counter()
-    code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "0.3")
+    code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "2")
     assert code == 0
     assert 2000 < found["paths"] < 1e12 == found["asked"]
     assert time.perf_counter() - started < 15

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import sys
+from pathlib import Path
+
 import pytest
 
 import certbound as cb
+from certbound.cli.app import run
 from certbound.cli.messages import BAD_INPUT, FAILED, InputError, explain, split_cure, write_error
 
 
@@ -74,3 +79,41 @@ def test_three_lines_are_written(capsys: pytest.CaptureFixture[str]) -> None:
     write_error("verify refused its input", "because", "do this")
     lines = capsys.readouterr().err.splitlines()
     assert lines == ["certbound: verify refused its input", "  why: because", "  try: do this"]
+
+
+@pytest.mark.parametrize(("body", "why"), [
+    ("problem = 1 / 0", r"the module raised ZeroDivisionError in line 2 of raising\.py: division by zero"),
+    ("from math import nothing", r"the module raised ImportError in line 2 of raising\.py: cannot import name"),
+    ("import not_installed_here", r"the module raised ModuleNotFoundError in line 2 of raising\.py: No module named"),
+    ("def problem(): return {}['key']", r"the module raised KeyError in line 2 of raising\.py: 'key'"),
+    ("def problem(): return int('x')", r"the module raised ValueError in line 2 of raising\.py: invalid literal"),
+    ("problem = np.linalg.inv(np.zeros((2, 2)))", r"LinAlgError in line 2 of raising\.py: Singular matrix"),
+    ("import certbound as cb; cb.Box([1], [0])", r"`low` must not exceed `high`, got 1 > 0"),
+    ("raise SystemExit(0)", "the module ended the program"),
+    ("def problem(): raise SystemExit(0)", "the module ended the program"),
+])  # fmt: skip
+def test_an_error_inside_a_module_is_the_modules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], body: str, why: str
+) -> None:
+    """Neither is its name wrong, nor does the exit code of what it raised pass for an answer."""
+    (tmp_path / "raising.py").write_text(f"import numpy as np\n{body}\n")
+    monkeypatch.chdir(tmp_path)
+    try:
+        assert run(["verify", "raising:problem"]) == 2
+    finally:
+        sys.modules.pop("raising", None)
+    said = capsys.readouterr().err
+    assert re.search(why, said)
+    assert "check the name" not in said
+
+
+def test_an_error_says_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+    write_error("a\x1b[2J", "b\nVALID", "c\u202e")
+    assert capsys.readouterr().err == "certbound: a [2J\n  why: b VALID\n  try: c\n"
+
+
+def test_a_trajectory_without_noise_says_that_it_came_before_the_method() -> None:
+    problem = cb.load("ou", rate=0.5).replace(initial=[1.0])
+    for method, said in (("auto", ""), ("quadratic", ", looked for before quadratic")):
+        verdict = cb.verify_safety(problem, method=method)
+        assert (verdict.status, verdict.method) == ("UNSAFE_NOMINAL", f"noise-free trajectory{said}")

@@ -46,9 +46,22 @@ def test_steps_of_discrete_time_hold_nothing() -> None:
         cb.Problem(system, initial=[0], safe=safe, horizon=4, plan=lambda x: -x, hold=2)
 
 
-def test_times_are_the_decimal_numbers_that_they_are_written_as() -> None:
+def test_a_horizon_is_a_whole_number_of_holds_up_to_rounding() -> None:
     assert cart(horizon=0.3, hold=0.1).samples == 3  # in floats 0.3 / 0.1 is less
     assert cart(hold=None).samples == 0
+    with pytest.raises(ValueError, match="must fit into the horizon"):
+        cart(hold=0.1 * (1 + 1e-12))
+
+
+@pytest.mark.parametrize(("time", "refused"), [(0.1, True), (0.15, False), (0.5, False)])
+def test_a_law_that_jumps_at_a_sample_is_refused_where_rounding_decides(time: float, *, refused: bool) -> None:
+    """A tenth of a second is before the float 0.1, and a program that reads its clock then says it is not."""
+    changes = {"horizon": 1.0, "plan": lambda t, x: -2 * x[0] + np.where(t < time, 0.5, 0.0)}
+    if refused:
+        with pytest.raises(ValueError, match=r"rounding decides, got \(t < 0.1\): .* at a sampling time"):
+            cart(**changes)
+    else:
+        assert cart(**changes).samples == 10
 
 
 def test_who_knows_no_sampling_times_does_not_get_a_closed_loop() -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +17,7 @@ from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from certbound.problem.files.loading import loads
 from certbound.problem.jumps_as_plan import in_pieces
-from certbound.problem.model import compile_numpy
+from certbound.problem.model import between_jumps, compile_numpy
 from certbound.safety.certificate import certificate_text, problem_data
 
 TEXT = """
@@ -66,6 +70,39 @@ def test_a_jump_at_a_known_time_lies_between_two_pieces(field, horizon, pieces):
     for t in rng.uniform(0, float(horizon), 40):
         row = cut.plan[int(t / float(horizon) * pieces)]
         assert after(t, 0.3, *row) == pytest.approx(before(t, 0.3), abs=0)
+
+
+def test_a_jump_that_misses_the_end_of_its_piece_is_told() -> None:
+    """0.3 and 0.1 + 0.2 as floats: two jumps about the end of the third tenth, and what holds in between."""
+    cut = in_pieces(given("-x + where(t < 0.3, 0.2, where(t < 0.1 + 0.2, 7, 0.1))", "1"))
+    change = cut.changes[3]
+    assert (change.first, change.last) == (Fraction(0.3), Fraction(0.1) + Fraction(0.2))
+    before, after = cut.plan[2], cut.plan[3]
+    assert (np.array(change.low) <= np.minimum(before, after)).all()
+    values = compile_numpy(cut.closed_loop)
+    between = [values(0.3, 0.0, *row)[0] for row in itertools.product(*zip(change.low, change.high))]
+    assert max(between) >= 7
+    assert values(0.2, 0.0, *before) == 0.2
+    assert values(0.4, 0.0, *after) == 0.1
+    exact = in_pieces(given("-x + where(t < 0.5, 0.2, 0)", "1"))
+    assert [(one.first, one.last) for one in exact.changes] == [(k, k) for k in (0, Fraction(1, 2), 1)]
+
+
+def test_jumps_that_no_float_names_do_not_part_the_noise() -> None:
+    system = cb.ContinuousSystem(lambda t, x: np.where(3 * t < 1, x, 2 * x), states=1, diffusion=1.0)
+    assert between_jumps(system.dynamics, 1, 1.0) == [(1.0, system.dynamics)]
+
+
+def test_in_discrete_time_every_step_is_decided_or_refused() -> None:
+    """0.1*t <= 0.9 is false of the ninth step on floats, and true after rounding."""
+
+    def walk(test: Callable[[Any], Any]) -> cb.Problem:
+        system = cb.DiscreteSystem(lambda t, x: [0.5 * x[0] + np.where(test(t), 5.0, 0.0)], states=["x"])
+        return cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=10)
+
+    with pytest.raises(ValueError, match=r"rounding decides, got .* at a step"):
+        walk(lambda t: 0.1 * t <= 0.9)
+    assert walk(lambda t: 0.1 * t <= 0.85).horizon == 10
 
 
 @pytest.mark.parametrize(

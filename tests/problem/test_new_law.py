@@ -43,7 +43,8 @@ class ArcSine(BoxLaw):
         return np.sin(0.5 * np.pi * v)
 
 
-ROW = laws.Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 2 for square in squares])
+ROW = laws.Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 2 for square in squares],
+               bounded=True)  # fmt: skip
 """The checker's row: what it proves itself."""
 
 

@@ -125,7 +125,7 @@ def test_a_table_without_a_scale_is_read(tmp_path):
 
 def test_laplace_noise_is_bounded_by_value_functions_alone():
     problem = walk(cb.Laplace(scale=0.1))
-    verdict = cb.verify_safety(problem.replace(delta=1e-9), time_limit=5)
+    verdict = cb.verify_safety(problem.replace(delta=1e-9), time_limit=60)
     assert verdict.status == "UNSAFE"
     assert verdict.log10_lower <= verdict.log10_delta < 0
     assert "Laplace noise has no variance proxy" in verdict.answers["linear"].reason
@@ -144,6 +144,10 @@ def test_laplace_noise_is_bounded_by_value_functions_alone():
         (lambda: cb.Discrete(values=[-1, 1], probabilities=[1.0]), "one for each of `values`, got 1 for 2"),
         (lambda: cb.Histogram(edges=[-1, 1], probabilities=[0.5, 0.5]), "one for each of `edges` but one, got 2 for 2"),
         (lambda: cb.Histogram(edges=[-1, 0, 1], probabilities=[0.5, 0.49]), "must sum to 1"),
+        (lambda: cb.Histogram(edges=np.linspace(-1, 1, 202), probabilities=np.full(201, 1 / 201)),
+         "at most 200 entries, since every draw .* goes through all of them, got 201; join neighbouring bins"),
+        (lambda: cb.Discrete(values=np.linspace(-1, 1, 201), probabilities=np.full(201, 1 / 201)),
+         "at most 200 entries, since .*, got 201; round values to fewer"),
         (lambda: cb.Histogram(edges=[-1, 0, 2], probabilities=[0.5, 0.5]), "must have mean 0"),
         (lambda: cb.Histogram(edges=[-1, -1, 1], probabilities=[0.5, 0.5]), "`edges` must rise"),
         (lambda: cb.Triangular(halfwidth=-1), "`halfwidth` must not be negative"),

@@ -210,3 +210,11 @@ def test_the_edge_of_a_disc_belongs_to_it():
     turn = cb.DiscreteSystem(lambda x: [x[0], x[1]], states=2, noise=cb.Rademacher(scale=[1.0, 0.0]))
     avoid = exits(turn, [cb.Outside(cb.Ball([2.0, 0.0], 1.0))], steps=None, horizon=1)
     assert avoid.probability == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_path_that_passes_an_obstacle_without_width_between_two_steps_has_failed():
+    """p' = 1 from 0 passes {p = .3} between two steps, and does not come to {p = 1.5}."""
+    system = cb.ContinuousSystem(lambda x: [1 + 0 * x[0], -x[1]], states=2, diffusion=np.array([[0.0], [0.1]]))
+    for region, share in ((cb.Box([0.3], [0.3], coordinates=[0]), 1.0), (cb.Box([1.5], [1.5], coordinates=[0]), 0.0)):
+        subject = cb.Problem(system, initial=[0.0, 0.0], safe=[cb.Outside(region)], horizon=1.0)
+        assert simulate_exits(subject, paths=100, rng=1, steps=4).probability == share

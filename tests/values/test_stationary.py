@@ -31,7 +31,8 @@ def test_sums_lie_within_their_error_of_the_exact_ones(kind: str) -> None:
         values[0] -= values.sum()
     scale = 1e-310 if kind == "tiny" else 1.0
     given = [Fraction(value * scale) / 3 for value in values.tolist()]
-    for coefficients in (given, leaving_rate._derivative(given), leaving_rate._derivative(leaving_rate._derivative(given))):
+    once = leaving_rate._derivative(given)
+    for coefficients in (given, once, leaving_rate._derivative(once)):
         y = np.concatenate([np.arange(-7, 8, 2) / 8, [1 - 2.0**-14, -1 + 2.0**-14]])
         found, error = leaving_rate._summed(coefficients, y)
         exact = [exactly(coefficients, place) for place in y.tolist()]

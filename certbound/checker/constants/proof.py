@@ -109,10 +109,7 @@ class _Proof:
         for index, (item, box) in enumerate(zip(items, boxes)):
             with self.budget.passing():
                 self._check_cell(Record(item, f"proof.cells[{index}]", _CELL), box, whole=len(boxes) == 1)
-        if record.flag("assumed"):
-            self._check_assumed(boxes[0])
-        else:
-            self._check_constants()
+        self._check_constants(boxes[0], assumed=record.flag("assumed"))
         return exit_probability(self._kummer(), self.budget)
 
     def _check_cell(self, cell: Record, box: Box, *, whole: bool) -> None:
@@ -170,27 +167,32 @@ class _Proof:
                 certain = not self.model.continuous and k == 0 and not random  # nothing has deviated from the tube yet
                 room = arb(0) if certain else self.rooms[k]
                 if room is None:
-                    raise Unproved(f"`proof.rooms` states nothing on piece {k}, where '{label}' is asked")
+                    raise Unproved(f"`proof.rooms` states nothing on piece {k}, where \"{label}\" is asked")
                 if not (radii[k] + room) * length <= left:
-                    raise Unproved(f"'{label}' was not shown to leave the stated room on piece {k}")
+                    raise Unproved(f"\"{label}\" was not shown to leave the stated room on piece {k}")
 
-    def _check_constants(self) -> None:
-        """Rate or gain, sigma and nu hold on the region."""
+    def _check_constants(self, start: Box, *, assumed: bool) -> None:
+        """Rate or gain, sigma and nu hold on the region; or that is assumed, of a model without jumps there."""
         model = self.model
         box = self._global_box()
         contraction = Contraction(model, self.structure, self.norm.metric, self.budget)
-        contraction.prove(box, self.rate, "rate" if model.continuous else "gain")
         spread = Spread(model, self.norm.metric, self.budget)
+        if assumed:
+            contraction.smooth.prove(box, "the dynamics")
+            if spread.smooth is not None:
+                spread.smooth.prove(box[: 1 + model.dimension], "the noise")
+            self._check_assumed(contraction, spread, start)
+            return
+        contraction.prove(box, self.rate, "rate" if model.continuous else "gain")
         spread.prove(box[: 1 + model.dimension], self.sigma, self.nu)
 
-    def _check_assumed(self, start: Box) -> None:
+    def _check_assumed(self, contraction: Contraction, spread: Spread, start: Box) -> None:
         """What is assumed may not contradict the model: its constant noise, its Jacobian and noise at a start.
 
         A constant noise leaves nothing to assume of sigma and nu, which are proved in the stated metric.
         """
-        model, metric = self.model, self.norm.metric
+        model = self.model
         point = [(arb(0), arb(0)), *((low, low) for low, _ in start)]
-        spread = Spread(model, metric, self.budget)
         if spread.contradicts(point, self.sigma, self.nu):
             raise Unproved(
                 f"the stated sigma = {float(self.sigma):.9g} and nu = {float(self.nu):.6g} contradict the file's own "
@@ -198,7 +200,6 @@ class _Proof:
             )
         inputs = [] if model.plan is None else [(arb(x), arb(x)) for x in model.plan[0]]
         disturbances = [(arb(low), arb(low)) for low, _ in model.disturbance]
-        contraction = Contraction(model, self.structure, metric, self.budget)
         if contraction.contradicts([*point, *inputs, *disturbances], self.rate):
             raise Unproved(
                 f"the stated {'rate' if model.continuous else 'gain'} = {float(self.rate):.9g} contradicts the file's "
@@ -217,7 +218,8 @@ class _Proof:
             (arb.neg_inf() if low is None else arb(low), arb.pos_inf() if high is None else arb(high))
             for low, high in ends
         ]
-        columns = [] if model.plan is None else list(zip(*model.plan))
+        rows = [*(model.plan or []), *(row for change in model.changes or [] for row in (change.low, change.high))]
+        columns = list(zip(*rows))
         inputs = [(arb(min(column)), arb(max(column))) for column in columns]
         disturbances = [(arb(a), arb(b)) for a, b in model.disturbance]
         return [(arb(0), arb(model.horizon)), *states, *inputs, *disturbances]

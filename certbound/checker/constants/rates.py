@@ -48,6 +48,7 @@ class Contraction:
             graph, self.atoms, risky, variables=len(model.dynamics.inputs), generalised=True, unbounded=True
         )
         self.program.prepare([])
+        self.smooth = Smooth(graph, risky, len(model.dynamics.inputs), budget)
         self.relevant = 0
         for node in [*self.atoms, *risky]:
             self.relevant |= graph.masks[node]
@@ -92,6 +93,31 @@ class Contraction:
         if self.model.continuous:
             return is_positive_definite(metric * (2 * bound) - turned - turned.transpose(), self.budget)
         return is_positive_definite(metric * (bound * bound) - jacobian.transpose() * turned, self.budget)
+
+
+class Smooth:
+    """Where nothing jumps and everything is defined: there alone a slope bounds how far two values are apart."""
+
+    def __init__(self, graph: Graph, risky: Sequence[int], inputs: int, budget: Budget) -> None:
+        self.program = Program(graph, [], risky, variables=inputs, generalised=True, unbounded=True)
+        self.program.prepare([])
+        self.budget, self.relevant = budget, 0
+        for node in risky:
+            self.relevant |= graph.masks[node]
+
+    def prove(self, box: Box, what: str) -> None:
+        """Prove it on a box of all inputs."""
+        if not _everywhere(box, self._holds, self.relevant, self.budget):
+            raise Unproved(
+                f"{what} was not shown to be defined and without jumps wherever constants are stated; a domain may do"
+            )
+
+    def _holds(self, box: Box) -> bool:
+        try:
+            self.program.run([low.union(high) if low < high else low for low, high in box])
+        except Undecided:
+            return False
+        return True
 
 
 def _is_risky(op: str) -> bool:
@@ -198,6 +224,7 @@ class Spread:
         self.model, self.metric, self.budget = model, metric, budget
         self.root = cholesky(metric, budget)
         self.program: Program | None = None
+        self.smooth: Smooth | None = None
         self.relevant = 0
         diffusion = model.noise.diffusion
         if isinstance(diffusion, Tape):
@@ -205,6 +232,8 @@ class Spread:
             nodes = graph.include(diffusion, [graph.input(slot) for slot in range(len(diffusion.inputs))])
             outputs = [nodes[output] for output in diffusion.outputs]
             self.program = Program(graph, outputs, variables=len(diffusion.inputs))
+            risky = [k for k in graph.reachable(outputs) if _is_risky(graph.node(k).op)]
+            self.smooth = Smooth(graph, risky, len(diffusion.inputs), budget)
             self.program.prepare([])
             for node in outputs:
                 self.relevant |= graph.masks[node]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import reduce
 from math import comb
 
@@ -19,7 +20,7 @@ from certbound.checker.balls import cholesky, column, largest_eigenvalue, magnit
 from certbound.checker.constants.kummer import growth_integral
 from certbound.checker.expressions import Program, Undecided, expand
 from certbound.checker.report import Budget, Unproved
-from certbound.checker.statement import Model, Structure
+from certbound.checker.statement import Change, Model, Structure
 
 ORDER = 6
 KINK_PARTS, SLIP = 16, arb(2) ** -20
@@ -147,20 +148,29 @@ class Tube:
             return []
         if not self.model.continuous:
             return [arb(x) for x in plan[min(k, len(plan) - 1)]]
-        piece = self.pieces[k]
-        share = arb(self.model.horizon) / len(plan)
-        row = min(int(float((piece.start + piece.end) / 2 / share)), len(plan) - 1)
-        edges = share * row, share * (row + 1)
-        slack = arb(self.model.horizon) * arb(2) ** -48
-        if not (piece.start >= edges[0] - slack and piece.end <= edges[1] + slack):
+        piece, count = self.pieces[k], len(plan)
+        horizon, first, last = (Fraction(float(x)) for x in (arb(self.model.horizon), piece.start, piece.end))
+        near = horizon / 2**47
+        row = min(int((first + last) / 2 * count / horizon), count - 1)
+        if not (first >= horizon * row / count - near and last <= horizon * (row + 1) / count + near):
             raise Unproved(f"piece {k} does not lie between two changes of the plan")
-        first, last = arb(0), slack
         inputs = [arb(x) for x in plan[row]]
-        # an end that misses the plan's change by rounding sees both rows
-        for edge, other in ((piece.start - edges[0], row - 1), (edges[1] - piece.end, row + 1)):
-            if not edge >= first and 0 <= other < len(plan) and last > 0:
-                inputs = [a.union(arb(b)) for a, b in zip(inputs, plan[other])]
+        # an end that misses the plan's change sees what is beyond it
+        for edge, beyond in ((row, row - 1), (row + 1, row + 1)):
+            change = self._change(edge)
+            if change.first < change.last and change.first < last and first < change.last:
+                inputs = [a.union(arb(b)).union(arb(c)) for a, b, c in zip(inputs, change.low, change.high)]
+            if 0 <= beyond < count and (first < change.first if edge == row else last > change.last):
+                inputs = [a.union(arb(b)) for a, b in zip(inputs, plan[beyond])]
         return inputs
+
+    def _change(self, edge: int) -> Change:
+        """What happens at an end of the equal pieces on which the plan's rows hold."""
+        if self.model.changes is not None:
+            return self.model.changes[edge]
+        assert self.model.plan is not None
+        time = Fraction(self.model.horizon) * edge / len(self.model.plan)
+        return Change(time, time, [], [])
 
     def defect(self, k: int) -> arb:
         """Upper bound of |p' - f(p, d, t)|_P over piece k and all d (discrete time: of |p_{k+1} - f(p_k, d, k)|_P)."""

@@ -78,7 +78,7 @@ def _faces_of(constraint: Constraint, sign: int, horizon: float) -> list[_Face]:
     whole = constraint.during in (None, (0.0, horizon))
     single = constraint.inside or len(region.bounds) == 1
     if not single or region.round or isinstance(region.center, Tape) or not whole:
-        raise Unproved(f"'{constraint.label}' is no interval that always holds and stands still")
+        raise Unproved(f"\"{constraint.label}\" is no interval that always holds and stands still")
     found = []
     for number, bound in enumerate(region.bounds):
         (slope,), side = region.face(number), 1 if constraint.inside else -1
@@ -256,7 +256,7 @@ def check_drift(model: Model, value: object, budget: Budget) -> arb:
     for constraint in model.constraints:
         for face in _faces_of(constraint, sign, model.horizon):
             if not (face.slope <= 0 and face.excess(arb(sign * limit)) <= 0):
-                raise Unproved(f"'{constraint.label}' was not shown to be kept on the whole half-line")
+                raise Unproved(f"\"{constraint.label}\" was not shown to be kept on the whole half-line")
     size = model.noise.covariance()[0, 0].upper()
     ahead = sign * _polynomial(model.dynamics, fmpq_poly([0, sign]))[0] - fmpq_poly([0, 1])
     about = ahead(fmpq_poly([sign * _exact(limit), 1]))

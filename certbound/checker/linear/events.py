@@ -18,11 +18,13 @@ from functools import reduce
 
 from flint import arb, arb_mat
 
-from certbound.checker.balls import below_and_above, identity, magnitude, quadratic, tail, upper
+from certbound.checker.balls import below_and_above, diagonal, identity, magnitude, quadratic, tail, upper
 from certbound.checker.linear.response import Piece
 from certbound.checker.report import Budget, Unproved
 
 _NEGLIGIBLE = 1e-3
+MOST_ENTRIES = 1_000_000
+"""Numbers beyond which what bounded noise does at most is not looked at: some 100 MB."""
 
 Level = arb | None
 
@@ -95,9 +97,13 @@ def chain(
 
 
 def sub_gaussian(
-    rows: Sequence[Sequence[arb]], levels: Sequence[Level], proxies: Sequence[arb_mat], budget: Budget
+    rows: Sequence[Sequence[arb]], levels: Sequence[Level], proxies: Sequence[arb_mat], budget: Budget,
+    drives: Sequence[arb_mat] | None = None,
 ) -> arb:
-    """Discrete time, sub-Gaussian noise: sum of exp(-z^2/(2 r V r^T))."""
+    """Discrete time, sub-Gaussian noise: sum of exp(-z^2/(2 r V r^T)).
+
+    ``drives`` (`bounded_drives`) leaves out the steps at which z is no less than the largest r . Z there is.
+    """
     total = arb(0)
     for k, (row, level) in enumerate(zip(rows, levels)):
         budget.check()
@@ -107,9 +113,42 @@ def sub_gaussian(
         variance = _variance(flat, proxies[k]).upper()
         if not level >= 0:
             return arb(1)
-        if not variance.is_zero():
-            total += (-level * level / (2 * variance)).exp()
+        if variance.is_zero() or (drives is not None and level >= _reach(flat, drives[k])):
+            continue
+        total += (-level * level / (2 * variance)).exp()
     return upper(total)
+
+
+def bounded_drives(
+    transitions: Sequence[arb_mat], matrix: arb_mat, halfwidth: Sequence[arb], budget: Budget
+) -> list[arb_mat] | None:
+    """At every step the matrices F ... F G diag(h) of all noise before it, side by side; None where they are too many.
+
+    Z_0 = 0 and |w_j| <= h_j, so that |r . Z_k| is at most the sum of the absolute values of r times the k-th one.
+    """
+    n, m, steps = matrix.nrows(), matrix.ncols(), len(transitions)
+    entries = (steps + 1) * steps * n * m // 2
+    if entries > MOST_ENTRIES:
+        return None
+    budget.hold(entries)
+    fresh = matrix * diagonal(list(halfwidth))
+    found = [arb_mat(n, 0)]
+    for transition in transitions:
+        budget.check()
+        before = transition * found[-1] if found[-1].ncols() else found[-1]
+        found.append(arb_mat([[*old, *new] for old, new in zip(_rows(before), fresh.tolist())]))
+    return found
+
+
+def _rows(a: arb_mat) -> list[list[arb]]:
+    return a.tolist() if a.ncols() else [[] for _ in range(a.nrows())]
+
+
+def _reach(flat: arb_mat, drive: arb_mat) -> arb:
+    """The largest value of a row where all noise does its worst."""
+    if not drive.ncols():
+        return arb(0)
+    return upper(sum((abs(x) for x in (flat * drive).entries()), arb(0)))
 
 
 class Windows:

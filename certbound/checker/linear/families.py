@@ -43,7 +43,7 @@ def leaving(
     for family in families:
         found = exceedance(family)
         if not found < 1:
-            raise Unproved(f"nothing is left for the noise by '{family.label}'")
+            raise Unproved(f"nothing is left for the noise by \"{family.label}\"")
         single.append(upper(2 * found if family.both else found))
     total = upper(sum(single, arb(0) if paid is None else paid))
     if not normal or not total > _LIKELY:

@@ -11,7 +11,8 @@ constraints hold wherever Z stays below what y and R leave, and the probabilitie
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -19,7 +20,7 @@ from flint import arb, arb_mat, ctx
 
 from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums, upper
 from certbound.checker.linear.diffusion import Along, Asked, StateNoise, Stopped
-from certbound.checker.linear.events import Windows, chain, sub_gaussian
+from certbound.checker.linear.events import Windows, bounded_drives, chain, sub_gaussian
 from certbound.checker.linear.families import Family, leaving
 from certbound.checker.linear.remainder import OutputRemainder, PieceData, Polytope, remainders
 from certbound.checker.linear.response import (
@@ -39,11 +40,14 @@ from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.reading import entries as listed
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, structure_of
+from certbound.checker.words import named
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
 MOST_ROWS = 64
 MOST_STATES = 100
+MOST_NAMED = 5
+"""Inputs that one message names."""
 _BITS, _MOST_BITS = 128, 3000
 _MILD = 0.25
 """Norm of the slopes times a piece, up to which series run well in the states' own units."""
@@ -314,20 +318,44 @@ class _Cell:
         if self.state is not None and not self.state.holds(k, low, high):
             raise Unproved(f"the state was not shown to stay in the set over which its noise is bounded on piece {k}")
         sides = {unit: (low[d], high[d]) for d, unit in enumerate(self.shared.units)}
+        jumped = self._jumped(k, outputs, sides)
         for i, output in enumerate(outputs):
             output.prepare(data)
             hidden = hidden_of[i]
             bounded = all(slot > self.model.dimension or slot - 1 in sides for slot in hidden)
             if hidden and not (bounded and output.is_decided(sides)):
-                names = ", ".join(self.model.dynamics.inputs[slot] for slot in hidden)
-                raise Unproved(f"{self.model.states[i]} may jump with {names}, in which it is linear otherwise")
+                raise Unproved(self._jumping(i, hidden))
             frame = self.frames[i] if number_ is None else self.shared.coordinates(output.states)
             polytope = Polytope(rows=self.rows[k], low=low, high=high, frame=frame, sides=sides)
-            least, most = (self.low[k][i] * scale).upper(), (self.high[k][i] * scale).lower()
+            least = (self.low[k][i] * scale + jumped[i]).upper()
+            most = (self.high[k][i] * scale - jumped[i]).lower()
             if not output.prove(polytope, least, most, self.budget):
-                name = self.model.states[i]
+                name = named(self.model.states[i])
                 at = f"piece {k}" if self.model.continuous else f"step {k}"
                 raise Unproved(f"the remainder of {name} was not shown to stay in its box on {at}")
+
+    def _jumped(self, k: int, outputs: Sequence[OutputRemainder], sides: Mapping[int, tuple[arb, arb]]) -> list[arb]:
+        """How much of B a row of the plan takes that holds on a part of piece k, beside its own pieces.
+
+        There beta misses what the piece's own row gives by at most D. All bounds of R rest on integrals of |beta - m|
+        over a piece, m the middle of B: with beta elsewhere as much inside of B as that part times D, they hold.
+        """
+        found = self.shared.beside(k)
+        if found is None:
+            return [arb(0)] * len(outputs)
+        inputs, part = found
+        data, widths = self._data(k), []
+        values = [*data.values[: len(data.values) - len(inputs)], *inputs]
+        for output in outputs:
+            widths.append((output.width(replace(data, values=values), sides) * part).upper())
+        return widths
+
+    def _jumping(self, i: int, hidden: Sequence[int]) -> str:
+        """What is not proved where state i may jump with inputs that it is linear in otherwise."""
+        inputs = self.model.dynamics.inputs
+        names = ", ".join(named(inputs[slot]) for slot in hidden[:MOST_NAMED])
+        more = " and others" if len(hidden) > MOST_NAMED else ""
+        return f"{named(self.model.states[i])} may jump with {names}{more}, in which it is linear otherwise"
 
     def _data(self, k: int) -> PieceData:
         """The parameters of the remainder's expressions."""
@@ -384,6 +412,13 @@ class _Cell:
         sizes = [part.probability * (2 if d < inner else 1) for d, part in enumerate(found[1])]
         return upper(sum(sizes, total + found[0]))
 
+    def _drives(self, moves: list[arb_mat]) -> list[arb_mat] | None:
+        """What noise of bounded entries does at most; None where these or the start have no bounds."""
+        noise = self.model.noise
+        if noise.halfwidth is None or self.model.initial.covariance is not None:
+            return None
+        return bounded_drives(moves, noise.constant(), noise.halfwidth, self.budget)
+
     def _leaving(self, values: list[arb_mat], families: list[Family]) -> arb:
         """The probability of all families of events together."""
         model, budget = self.model, self.budget
@@ -393,7 +428,8 @@ class _Cell:
             moves = [piece.transition for piece in self.pieces]
             if model.noise.gaussian:
                 return leaving(families, lambda f: chain(f.rows, f.levels, moves, values, budget), budget, normal=True)
-            return leaving(families, lambda f: sub_gaussian(f.rows, f.levels, values, budget), budget)
+            drives = self._drives(moves)
+            return leaving(families, lambda f: sub_gaussian(f.rows, f.levels, values, budget, drives), budget)
         given = self.record.array("window_levels", len(self.shared.windows), model.dimension)
         windows = Windows(self.pieces, values, self.shared.windows, budget)
         paid = windows.coordinates([[arb(x) for x in item] for item in given])

@@ -142,6 +142,7 @@ class OutputRemainder:
         self.slots = [*([0] if time else []), *(1 + j for j in states), *(1 + dimension + j for j in disturbances)]
         self.expansion = Expansion(graph, node, value, variables=count)
         self.plain = Program(graph, [], [value], variables=count)
+        self.values = Program(graph, [value], [value], variables=count)
         self.programs: list[Expansion | Program] = [self.expansion, self.plain]
         self.kinked: tuple[Program, Program] | None = None
         if any(graph.node(index).op in ("abs", "min", "max", "kink") for index in graph.reachable([node])):
@@ -190,17 +191,30 @@ class OutputRemainder:
 
         States without a side are kept at s = 0.
         """
-        inputs = [arb(0)] * self.count
-        inputs[0] = arb(0, self.piece.half)
-        for j, (low, high) in sides.items():
-            inputs[1 + j] = low.union(high).union(arb(0))
-        for j, (value, size) in enumerate(zip(self.piece.disturbance, self.piece.disturbance_radius)):
-            inputs[1 + self.dimension + j] = value + arb(0, size)
         try:
-            self.plain.run(inputs)
+            self.plain.run(self._around(self.piece, sides))
         except Undecided:
             return False
         return True
+
+    def width(self, piece: PieceData, sides: Mapping[int, Side]) -> arb:
+        """How far values of the output may lie apart over such a piece; Unproved where it is not defined."""
+        self.values.prepare(piece.values)
+        try:
+            (value,) = self.values.run(self._around(piece, sides))
+        except Undecided as error:
+            raise Unproved("the dynamics is not defined where its inputs jump") from error
+        return (value.upper() - value.lower()).upper()
+
+    def _around(self, piece: PieceData, sides: Mapping[int, Side]) -> list[arb]:
+        """All of (tau, s, d), but that states without a side are 0."""
+        inputs = [arb(0)] * self.count
+        inputs[0] = arb(0, piece.half)
+        for j, (low, high) in sides.items():
+            inputs[1 + j] = low.union(high).union(arb(0))
+        for j, (value, size) in enumerate(zip(piece.disturbance, piece.disturbance_radius)):
+            inputs[1 + self.dimension + j] = value + arb(0, size)
+        return inputs
 
     def _form(self, frame: _Frame, box: _Box) -> Quadratic | None:
         """The remainder as a polynomial in xi, the box being |xi| <= 1; None where undecided."""

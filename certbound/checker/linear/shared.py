@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fractions import Fraction
 from itertools import pairwise
 
 from flint import arb
@@ -73,3 +74,22 @@ class Shared:
         if plan is None:
             return []
         return [arb(x) for x in plan[k * len(plan) // self.count if self.model.continuous else k]]
+
+    def beside(self, k: int) -> tuple[list[arb], arb] | None:
+        """Inputs on a part of piece k that a row of the plan reaches beside its own end, and that part; None: no such.
+
+        Each input as a ball that also holds what it is on the rest of the piece.
+        """
+        changes = self.model.changes
+        if changes is None:
+            return None
+        found, part, (edge, rest) = self.inputs(k), Fraction(0), divmod(k * (len(changes) - 1), self.count)
+        horizon = Fraction(self.model.horizon)
+        last = rest + len(changes) - 1 == self.count
+        for place in [*([edge] if rest == 0 else []), *([edge + 1] if last else [])]:
+            change, end = changes[place], horizon * place / (len(changes) - 1)
+            missed = max(change.last, end) - min(change.first, end)
+            if missed:
+                part += missed * self.count / horizon
+                found = [a.union(arb(b)).union(arb(c)) for a, b, c in zip(found, change.low, change.high)]
+        return (found, arb(part.numerator) / part.denominator) if part else None

@@ -15,6 +15,7 @@ from itertools import combinations, pairwise
 from flint import arb
 
 from certbound.checker.reading import Record, text
+from certbound.checker.words import quoted
 from certbound.errors import CertificateError
 
 Range = tuple[float, float]
@@ -60,7 +61,7 @@ def read_drawn(value: object, path: str, disturbances: Sequence[str]) -> tuple[D
 def _drawn(value: object, path: str, place: int) -> Drawn:
     name = text(value.get("law") if isinstance(value, dict) else None, f"{path}.law", 200)
     if name not in _LEVELS:
-        raise CertificateError(f"`{path}.law` must be one of {', '.join(_LEVELS)}, got {name[:40]!r}.")
+        raise CertificateError(f"`{path}.law` must be one of {', '.join(_LEVELS)}, got {quoted(name, 40)}.")
     record = Record(value, path, ("law", "level", "value", "mean"), ("tables",) if name in _TABLES else ())
     level, mean, size = record.text("level"), record.number("mean"), record.number("value", least=0.0)
     if level not in _LEVELS[name] or not size > 0:

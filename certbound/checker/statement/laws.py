@@ -35,6 +35,7 @@ class Law:
     tables: tuple[str, ...] = ()  # lists of numbers, under ``tables``
     gaussian: bool = False  # exactly normal
     uniform: bool = False  # independent entries, each uniform between its level and minus that
+    bounded: bool = False  # no entry is larger than its level, whatever its sign
     cut: Cut | None = None
 
 
@@ -80,17 +81,19 @@ LAWS = {
     # what it says of itself
     "subgaussian": Law(levels=("std", "variance", "covariance"), proxies=_as_they_are),
     # sinh(x)/x <= exp(x^2/6)
-    "uniform": Law(levels=("halfwidth",), proxies=_thirds, uniform=True, cut=cut_by("uniform", -1, 1)),
+    "uniform": Law(levels=("halfwidth",), proxies=_thirds, uniform=True, bounded=True,
+                   cut=cut_by("uniform", -1, 1)),
     # cosh(x) <= exp(x^2/2)
-    "rademacher": Law(levels=("scale",), proxies=_as_they_are, cut=lambda count, tables: atoms([-1, 1], [0.5, 0.5])),
+    "rademacher": Law(levels=("scale",), proxies=_as_they_are, bounded=True,
+                      cut=lambda count, tables: atoms([-1, 1], [0.5, 0.5])),
     # the sum of two uniform ones
     "triangular": Law(levels=("halfwidth",), proxies=lambda squares, data: [square / 6 for square in squares],
-                      cut=cut_by("triangular", -1, 1)),
+                      bounded=True, cut=cut_by("triangular", -1, 1)),
     "discrete": Law(levels=("scale",), proxies=_tabled("values", 0), tables=("values", "probabilities"),
                     cut=lambda count, tables: atoms(*tables)),
     "histogram": Law(levels=("scale",), proxies=_tabled("edges", 1), tables=("edges", "probabilities"),
                      cut=lambda count, tables: bins(count, *tables)),
     # its tails are those of an exponential
     "laplace": Law(levels=("scale",), proxies=None, cut=cut_by("laplace", -37, 37)),
-    "bounded": Law(levels=("halfwidth",), proxies=_bounded, flags=("independent",)),
+    "bounded": Law(levels=("halfwidth",), proxies=_bounded, flags=("independent",), bounded=True),
 }

@@ -10,6 +10,7 @@ from certbound.checker.balls import cholesky, column
 from certbound.checker.reading import Record, number, numbers, whole
 from certbound.checker.report import Unproved
 from certbound.checker.statement.problem import Model
+from certbound.checker.words import named
 from certbound.errors import CertificateError
 
 MOST_CELLS = 4096
@@ -28,7 +29,7 @@ def cells_of(model: Model, record: Record) -> list[list[tuple[arb, arb]]]:
         if len(row) < 2 or any(a > b for a, b in pairwise(row)):
             raise CertificateError(f"`proof.splits[{j}]` must be two or more numbers that do not fall.")
         if not (arb(row[0]) <= model.initial.low[j].lower() and arb(row[-1]) >= model.initial.high[j].upper()):
-            raise Unproved(f"the cells do not cover the initial set along {model.states[j]}")
+            raise Unproved(f"the cells do not cover the initial set along {named(model.states[j])}")
         sides.append([(arb(a), arb(b)) for a, b in pairwise(row)])
         count *= len(sides[-1])
         if count > MOST_CELLS:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import Any, NamedTuple
 
 from flint import arb, arb_mat
 
@@ -17,8 +19,9 @@ from certbound.checker.statement.law_pieces import Piece
 from certbound.checker.statement.laws import LAWS, Law
 from certbound.checker.statement.regions import Constraint, read_constraint
 from certbound.checker.statement.tapes import Hold, read_hold, read_tape
+from certbound.checker.words import quoted, shortened
 from certbound.errors import CertificateError
-from certbound.problem.model import Tape
+from certbound.problem.model import Tape, rounded_comparison
 
 MOST_STATES = 400
 MOST_STEPS = 100_000
@@ -37,7 +40,8 @@ class Noise:
 
     ``proxy`` is the covariance (or variance proxy) of w in discrete time, the identity in continuous time, None where a
     law has none. ``gaussian`` says whether it is exactly normal; ``uniform`` holds the halfwidths of independent
-    uniform entries; ``entries`` the sizes of independent entries of one law, whose pieces at size 1 ``cut`` makes.
+    uniform entries; ``entries`` the sizes of independent entries of one law, whose pieces at size 1 ``cut`` makes;
+    ``halfwidth`` what no entry exceeds in size, None where nothing is known.
     """
 
     diffusion: arb_mat | Tape
@@ -46,6 +50,7 @@ class Noise:
     uniform: tuple[arb, ...] | None = None
     entries: tuple[arb, ...] = ()
     cut: Callable[[int], list[Piece]] | None = None
+    halfwidth: tuple[arb, ...] | None = None
 
     def constant(self) -> arb_mat:
         """A constant matrix; CertificateError of a tape."""
@@ -79,6 +84,15 @@ class Initial:
     around: bool = False
 
 
+class Change(NamedTuple):
+    """Rows of a plan change from ``first`` to ``last``, exact times; meanwhile inputs lie in ``low`` to ``high``."""
+
+    first: Fraction
+    last: Fraction
+    low: list[float]
+    high: list[float]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
     """A problem as the checker knows it; ``constraints`` ends with the domain where there is one."""
@@ -103,6 +117,7 @@ class Model:
     drawn: tuple[Drawn, ...] = ()  # constants, over whose values the probability is an average
     hold: Hold | None = None  # then the inputs of the dynamics are what its law said last
     by_ito: bool = False  # derived by Ito's formula: no disturbance sees coming noise then
+    changes: list[Change] | None = None  # of rows that do not change just at the ends of equal pieces; at 0, ..., T
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
 
     @property
@@ -114,6 +129,19 @@ class Model:
     def steps(self) -> int:
         """Steps of a discrete-time horizon."""
         return int(self.horizon)
+
+    def named_as(self, problem: Mapping[str, Any]) -> Model:
+        """The same by the name and the labels of a problem's data, where both state the same problem.
+
+        Nothing compares what is for humans, so that a file may say there what it likes.
+        """
+        labels = [shortened(str(row.get("label", ""))) for row in problem["constraints"]]
+        own = [replace(constraint, label=label) for constraint, label in zip(self.constraints, labels)]
+        target = self.target
+        if target is not None:
+            target = replace(target, label=shortened(str(problem["reach"].get("label", ""))))
+        constraints = (*own, *self.constraints[len(own) :])  # the domain stands behind them
+        return replace(self, name=str(problem.get("name", "")), constraints=constraints, target=target)
 
 
 def _names(record: Record, name: str, least: int) -> tuple[str, ...]:
@@ -162,7 +190,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
     if domain is not None:
         budget.hold(n * n // 4 + 1)
         constraints.append(Constraint.of_domain(domain))
-    return Model(
+    model = Model(
         name=record.text("name"), continuous=continuous, horizon=horizon, delta=delta, dynamics=dynamics,
         ends=record["leaving"] == "ends", states=states, hold=hold,
         plan=_plan(record, len(inputs) if hold is None else 0, continuous, horizon),
@@ -174,15 +202,31 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         constraints=tuple(constraints), domain=domain,
         stays="reach" in record.value and record["reach"].get("kind") == _STAYING,
     )
+    _refuse_rounding(model, path)
+    return model
+
+
+def _refuse_rounding(model: Model, path: str) -> None:
+    """CertificateError where a program that rounds takes another side of a comparison than exact arithmetic does."""
+    steps = 0 if model.continuous else int(min(model.horizon, MOST_STEPS))
+    given: list[tuple[object, int]] = [(model.dynamics, steps), (model.noise.diffusion, steps)]
+    if model.hold is not None:
+        given.append((model.hold.law, model.hold.count))
+    sets = [*model.constraints, *([] if model.target is None else [model.target])]
+    given += [(constraint.region.center, steps) for constraint in sets]
+    for tape, samples in given:
+        found = rounded_comparison(tape, float(steps or model.horizon), samples) if isinstance(tape, Tape) else None
+        if found is not None:
+            raise CertificateError(f"`{path}` must not hold a comparison that rounding decides, got {found}.")
 
 
 def _unit(record: Record, continuous: bool) -> str:
-    """The unit of time, for the words of the claim; of the others nothing is made."""
+    """The unit of time, for the words of the claim, in quotes if it is the file's; of the others nothing is made."""
     units = record["units"] or {}
     if not isinstance(units, dict) or len(units) > MOST_STATES:
         raise CertificateError(f"`{record.at('units')}` must be texts by names.")
     own = {name: text(unit, record.at("units"), 20) for name, unit in units.items()}
-    return own.get("time", "s" if continuous else "steps")
+    return quoted(own["time"]) if "time" in own else "s" if continuous else "steps"
 
 
 def _plan(record: Record, inputs: int, continuous: bool, horizon: float) -> list[list[float]] | None:
@@ -226,19 +270,19 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
         return Noise(diffusion=drives, proxy=diagonal([arb(1)] * m), gaussian=True)
     name = text(value.get("law") if isinstance(value, dict) else None, f"{path}.law", 200)
     if name not in LAWS:
-        raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {name[:40]!r}.")
+        raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {quoted(name, 40)}.")
     law = LAWS[name]
     tables = ("tables",) if law.tables else ()
     record = Record(value, path, ("law", "level", "values", "matrix", *law.flags, *tables))
     drives, m = _drives(record, "matrix", states)
     proxy, sizes = _proxy(record, law, m, budget)
-    cut = law.cut
+    cut, halfwidth = law.cut, sizes if law.bounded else None
     if cut is None:
-        return Noise(diffusion=drives, proxy=proxy, gaussian=law.gaussian)
+        return Noise(diffusion=drives, proxy=proxy, gaussian=law.gaussian, halfwidth=halfwidth)
     found = [numbers(record["tables"][table], record.at(table), None) for table in law.tables]
     return Noise(
         diffusion=drives, proxy=proxy, gaussian=law.gaussian, uniform=sizes if law.uniform else None, entries=sizes,
-        cut=lambda count: cut(count, found),
+        cut=lambda count: cut(count, found), halfwidth=halfwidth,
     )  # fmt: skip
 
 
@@ -264,7 +308,8 @@ def _proxy(record: Record, law: Law, m: int, budget: Budget) -> tuple[arb_mat | 
     """The variance proxy that is proved of a law (None: it has none), and the sizes of entries that are independent."""
     level = record.text("level")
     if level not in law.levels:
-        raise CertificateError(f"`{record.at('level')}` must be one of {', '.join(law.levels)}, got {level[:40]!r}.")
+        known = ", ".join(law.levels)
+        raise CertificateError(f"`{record.at('level')}` must be one of {known}, got {quoted(level, 40)}.")
     if level == "covariance":
         found = _semidefinite(matrix(record.symmetric("values", m)), record.at("values"), budget)
         alone = all(found[i, j].is_zero() for i in range(m) for j in range(i))

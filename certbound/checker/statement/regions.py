@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from flint import arb, arb_mat
 
 from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix, quadratic
-from certbound.checker.reading import Record, entries, number, numbers, text, whole, wholes
+from certbound.checker.reading import Record, entries, number, numbers, whole, wholes
 from certbound.checker.report import Budget
 from certbound.checker.statement.tapes import read_tape
+from certbound.checker.words import shortened
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
 
@@ -183,7 +184,7 @@ def read_constraint(
     region = _region(record["region"], record.at("region"), dimension, budget)
     return Constraint(
         inside=record["kind"] != "outside", region=region, during=during,
-        label=text(record["label"], record.at("label"), 1000),
+        label=shortened(record.text("label")),
     )  # fmt: skip
 
 

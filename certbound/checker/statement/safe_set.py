@@ -11,6 +11,7 @@ from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
 from certbound.checker.statement.rooms import Grid, centres_of
+from certbound.checker.words import named
 from certbound.problem.model import Tape
 
 _MOST_BOXES = 20_000
@@ -50,6 +51,11 @@ class _Shape:
         """
         high = self.over(centre, radius)[1]
         return bool(high < 0 or (high <= 0 and not (self.outside and (strictly or self._thin()))))
+
+    def breaks(self, centre: Sequence[arb], radius: Sequence[arb]) -> bool:
+        """Whether every point of a box breaks it: regions are closed, so that a point on an obstacle's edge does."""
+        low = self.over(centre, radius)[0]
+        return bool(low > 0 or (self.outside and low >= 0))
 
     def _thin(self) -> bool:
         """Whether the region was not shown to have an interior, as a ball, a half-space and a box of a volume have."""
@@ -100,7 +106,7 @@ def _shape_of(constraint: Constraint, center: Sequence[arb], dimension: int) -> 
         rows = [region.lift(region.face(number), dimension) for number in range(len(region.faces))]
         bounds, bound = [arb(b) for b in region.bounds], None
         if not rows and not constraint.inside:
-            raise Unproved(f"'{constraint.label}' leaves nothing")
+            raise Unproved(f"\"{constraint.label}\" leaves nothing")
         if not rows:
             return None
     forms = [[(j, x) for j, x in enumerate(row) if not x.is_zero()] for row in rows]
@@ -127,7 +133,7 @@ class StepSet:
         """Whether every point of a box breaks a constraint, the same one."""
         centre = [(a + b) / 2 for a, b in box]
         radius = [(b - a) / 2 for a, b in box]
-        return any(shape.over(centre, radius)[0] > 0 for shape in self._shapes)
+        return any(shape.breaks(centre, radius) for shape in self._shapes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,17 +169,17 @@ class SafeSet:
         self.hull: list[Side] = []
         for j, (a, b) in enumerate(zip(low, high) if bounded else ()):
             if a is None or b is None:
-                raise Unproved(f"no constraint that a barrier can use bounds {model.states[j]}")
+                raise Unproved(f"no constraint that a barrier can use bounds {named(model.states[j])}")
             if not a <= b:
-                raise Unproved(f"no value of {model.states[j]} is safe")
+                raise Unproved(f"no value of {named(model.states[j])} is safe")
             self.hull.append((a, b))
 
     def _shape(self, constraint: Constraint) -> _Shape | None:
         region = constraint.region
         if constraint.during is not None:
-            raise Unproved(f"'{constraint.label}' has a time window, which this proof does not treat")
+            raise Unproved(f"\"{constraint.label}\" has a time window, which this proof does not treat")
         if isinstance(region.center, Tape):
-            raise Unproved(f"'{constraint.label}' moves, which this proof does not treat")
+            raise Unproved(f"\"{constraint.label}\" moves, which this proof does not treat")
         return _shape_of(constraint, [arb(value) for value in region.center], self.n)
 
     def _narrow(self, shape: _Shape, low: list[arb | None], high: list[arb | None]) -> None:

@@ -11,8 +11,9 @@ from typing import Any
 from certbound.checker.expressions import OPERATIONS
 from certbound.checker.reading import Record, number, whole, wholes
 from certbound.checker.reading import entries as listed
+from certbound.checker.words import shortened
 from certbound.errors import CertificateError
-from certbound.problem.model import Layer, Network, Node, Part, Tape
+from certbound.problem.model import Layer, Network, Node, Part, Tape, needed
 
 MOST_LAYERS, MOST_WIDTH = 32, 4096
 MOST_SAMPLES = 1000
@@ -27,11 +28,11 @@ class Hold:
     names: tuple[str, ...]
 
     def until(self, time: float, horizon: float) -> Hold:
-        """The same up to a sampling time; both times are read as the decimal numbers that they are written as.
+        """The same up to a sampling time, by the exact values of both floats.
 
         CertificateError where it is none.
         """
-        samples = self.count * Fraction(repr(time)) / Fraction(repr(horizon))
+        samples = self.count * Fraction(time) / Fraction(horizon)
         if samples.denominator != 1:
             raise CertificateError("`proof.time` must be a sampling time where inputs are held.")
         return replace(self, count=int(samples))
@@ -53,7 +54,9 @@ def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[in
 
     ``networks``, where there are any, are lists of layers, and ["network", which, output, ...arguments] is a node.
 
-    CertificateError where it is no straight-line program over known operations, or has another number of outputs.
+    CertificateError where it is no straight-line program over known operations, has another number of outputs, or a
+    node that no output needs: two tapes are the same function by what they need (`canonical`), and so must be what
+    proofs read of them.
     """
     record = Record(value, path, ("nodes", "outputs"), ("networks",))
     networks = _networks(record)
@@ -82,9 +85,13 @@ def read_tape(value: object, path: str, inputs: tuple[str, ...], shape: tuple[in
     if len(outputs) != count:
         raise CertificateError(f"`{path}.outputs` must have {count} entries, got {len(outputs)}.")
     try:
-        return Tape(inputs=inputs, nodes=tuple(nodes), outputs=tuple(outputs), shape=shape)
+        tape = Tape(inputs=inputs, nodes=tuple(nodes), outputs=tuple(outputs), shape=shape)
     except ValueError as error:
-        raise CertificateError(f"`{path}` is no tape: {error}") from error
+        raise CertificateError(f"`{path}` is no tape: {shortened(str(error), 200)}") from error
+    used = needed(tape.nodes, tape.outputs)
+    if not all(used):
+        raise CertificateError(f"`{path}.nodes[{used.index(False)}]` must go: no output needs it.")
+    return tape
 
 
 def _networks(record: Record) -> list[Network]:
@@ -99,7 +106,7 @@ def _networks(record: Record) -> list[Network]:
         try:
             found.append(Network(layers=tuple(_layer(row) for row in rows)))
         except ValueError as error:
-            raise CertificateError(f"`{path}` is no network: {error}") from error
+            raise CertificateError(f"`{path}` is no network: {shortened(str(error), 200)}") from error
     return found
 
 

@@ -34,13 +34,20 @@ Sum = tuple[dict[int, Fraction], Fraction]
 
 
 def restated(model: Model, proof: object, path: str) -> tuple[Model, object, str]:
-    """The model that a proof is about, that proof, and where it stands: in logarithms first, then in coordinates."""
+    """The model that a proof is about, that proof, and where it stands: in logarithms first, then in coordinates.
+
+    CertificateError where it rests on constants that are assumed: what a user states is stated of the problem's own
+    states, and says nothing of others.
+    """
+    given = path
     for engine, fields, derive in (
         ("logarithms", ("states",), logarithmic_model), ("coordinates", ("matrix", "inverse"), turned_model)
     ):  # fmt: skip
         if isinstance(proof, Mapping) and proof.get("engine") == engine:
             record = Record(proof, path, ("engine", *fields, "proof"))
             model, proof, path = derive(model, record), record["proof"], f"{path}.proof"
+    if path != given and isinstance(proof, Mapping) and proof.get("assumed") not in (None, False):
+        raise CertificateError(f"`{path}.assumed` must be false: constants are stated of the problem's own states.")
     return model, proof, path
 
 

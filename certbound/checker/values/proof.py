@@ -236,6 +236,11 @@ class _Discrete:
                 found = tm.chosen(np.array([target.holds(box) for box in self.starts]), over, found)
             else:
                 found = tm.chosen(off, found, step.apply(arrived))
+        if not self.above:
+            limits = self.model.constraints[:-1] if self.model.ends else self.model.constraints
+            first = StepSet(replace(self.model, constraints=limits), 0, self.budget)
+            failed = np.array([first.excludes(box) for box in self.starts])
+            found = tm.chosen(failed, tm.fixed(found.terms, np.ones(len(failed))), found)
         if self.model.ends and not self.above:
             domain = StepSet(replace(self.model, constraints=self.model.constraints[-1:]), 0, self.budget)
             within = np.array([domain.holds(box) for box in self.starts])

@@ -50,7 +50,7 @@ class Surroundings:
         self._start()
         for number, constraint in enumerate(model.constraints):
             if constraint.during is not None or isinstance(constraint.region.center, Tape):
-                raise Unproved(f"'{constraint.label}' has a window or moves, which this proof does not treat")
+                raise Unproved(f"\"{constraint.label}\" has a window or moves, which this proof does not treat")
             if constraint.region.round:
                 self._ball(number)
             elif constraint.inside:
@@ -79,7 +79,7 @@ class Surroundings:
             row = self._row(number, face)
             if sum(value != 0 for value in normal) == 1:
                 if not sum((abs(x) for x in row[:-1]), row[-1]) <= 0:
-                    raise Unproved(f"the working box was not shown to keep '{label}'")
+                    raise Unproved(f"the working box was not shown to keep \"{label}\"")
                 continue
             form = linear(row, -1)
             self._check_start(form, label)
@@ -90,7 +90,7 @@ class Surroundings:
         constraint = self.model.constraints[number]
         region = constraint.region
         if region.shape is not None or not region.radius > 0 or not isinstance(region.center, list):
-            raise Unproved(f"'{constraint.label}' is no ball, which this proof asks for")
+            raise Unproved(f"\"{constraint.label}\" is no ball, which this proof asks for")
         limit = arb(region.radius) ** 2
         rows = [[arb(0)] * (self.n + 1) for _ in range(self.n + 1)]
         rows[-1][-1] = arb(1)
@@ -135,7 +135,7 @@ class Surroundings:
 
     def _check_start(self, form: arb_mat, label: str) -> None:
         if not value(form, [*(low.union(high) for low, high in self.start), arb(1)]) >= 0:
-            raise Unproved(f"the starts were not shown to keep '{label}'")
+            raise Unproved(f"the starts were not shown to keep \"{label}\"")
 
 
 def linear(row: Sequence[arb], sign: int) -> arb_mat:

@@ -55,7 +55,7 @@ EXAMPLES = examples(
 DEFAULT_LIMIT = 60.0
 _LEAST = 1e-3
 _PATHS, _LONG = 1000, 10_000  # simulated where nothing was proved; steps that take too long for that
-_PATIENCE, _BEYOND = 3.0, 0.5  # seconds of it, and beyond a limit of time
+_PATIENCE = 3.0  # seconds of it
 
 MethodOption = Annotated[
     str,
@@ -101,7 +101,7 @@ def verify(
 
         verdict = verify_safety(
             subject, method=method, cells=cells, time_limit=clock.limit, progress=tell, smallest=smallest, jobs=jobs,
-            executor=executor, patient=time_limit is not None,
+            executor=executor, patient=time_limit is not None, started=clock.started,
         )  # fmt: skip
     seconds = time.perf_counter() - started
     if ":" not in problem:  # reasons and cures in the words of files
@@ -137,15 +137,15 @@ def verify(
 
 
 def _simulated(problem: Problem, left: float) -> str:
-    """What some simulated paths suggest where nothing was proved; empty where they would be dear, or tell nothing."""
-    if problem.horizon > _LONG:
+    """What some simulated paths suggest where nothing was proved; empty without time, or where they tell nothing."""
+    if problem.horizon > _LONG or left <= 0:
         return ""
     try:
         with spinner("simulating some paths"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             from certbound.simulation.estimates import simulate_exits
 
-            with Watch(min(max(left, 0.0) + _BEYOND, _PATIENCE)).running():
+            with Watch(min(left, _PATIENCE)).running():
                 found = simulate_exits(problem, paths=_PATHS, rng=0)
     except (ArithmeticError, OutOfTime, SolverError, ValueError):
         return ""

@@ -22,7 +22,8 @@ def level_along(event: Event, target: float) -> Array:
     the piece with the fastest turn raise the levels of all.
     """
     if not isinstance(event, WindowEvent):
-        return np.asarray(np.where(event.profile > 0, level_scale(event, event.profile, target), 0.0) * event.profile)
+        found = np.where(event.profile > 0, level_scale(event, event.profile, target), 0.0) * event.profile
+        return event.capped(found) if isinstance(event, StepEvent) else np.asarray(found)
     deviation = np.sqrt(np.maximum(event.course.windows.end_high, 0.0))[event.course.window]
     shape = np.maximum(event.profile, deviation)
     factor = level_scale(event, shape, target, event.cost)

@@ -45,7 +45,7 @@ def load(source: str | Path, **parameters: Any) -> Problem:
     ------
     ValueError
         If there is no such problem or parameter (the nearest is named), or the file is wrong: key, rule and
-        value.
+        value. What a module raises itself is passed on.
     TypeError
         If a module's name is neither a problem nor a function that returns one.
 
@@ -178,12 +178,15 @@ def _set_parameters(content: dict[str, Any], given: Mapping[str, Any]) -> None:
 
 def _load_module(text: str, parameters: Mapping[str, Any]) -> Problem:
     module_name, _, name = text.partition(":")
+    parts = module_name.split(".")
+    if not all(part.isidentifier() for part in parts):
+        raise ValueError(f"`source` must be package.module:name, got {text!r}.")
     try:
         module = _import(module_name)
-    except ImportError as error:
+    except ModuleNotFoundError as error:  # one that the module itself imports is an error inside it
+        if error.name not in {".".join(parts[: k + 1]) for k in range(len(parts))}:
+            raise
         raise ValueError(f"`source` must name an importable module, got {text!r}: {error}.") from error
-    except ValueError as error:
-        raise ValueError(f"`source` must be package.module:name, got {text!r}: {error}.") from error
     if not hasattr(module, name):
         public = [entry for entry in vars(module) if not entry.startswith("_")]
         raise ValueError(f"module {module_name!r} has no {name!r}{nearest(name, public)}")

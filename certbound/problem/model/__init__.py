@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         varying_outputs,
         watched,
     )
-    from certbound.problem.model.calling import call_network
+    from certbound.problem.model.comparisons import rounded_comparison
     from certbound.problem.model.derivative import jacobian
     from certbound.problem.model.evaluation import compile_numpy, compile_scalar
     from certbound.problem.model.graph import Graph, substitute
@@ -37,22 +37,22 @@ if TYPE_CHECKING:
     )
     from certbound.problem.model.recombined import in_logarithms, turned_tape
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
-    from certbound.problem.model.time_jumps import between_jumps, cut_at_jumps
-    from certbound.problem.model.tracing import trace
+    from certbound.problem.model.time_jumps import Change, between_jumps, cut_at_jumps
+    from certbound.problem.model.tracing import call_network, trace
 
 _HOME = {
     "analysis": "adds_plainly deciding edged is_zero selected sources varying_outputs watched",
     "derivative": "jacobian",
     "evaluation": "compile_numpy compile_scalar",
     "graph": "Graph substitute",
-    "calling": "call_network",
+    "comparisons": "rounded_comparison",
     "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
     "recombined": "in_logarithms turned_tape",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
-    "time_jumps": "between_jumps cut_at_jumps",
-    "tracing": "trace",
+    "time_jumps": "between_jumps Change cut_at_jumps",
+    "tracing": "call_network trace",
 }
 
 __all__ = [
@@ -61,6 +61,7 @@ __all__ = [
     "between_jumps",
     "ARITY",
     "call_network",
+    "Change",
     "compile_numpy",
     "compile_scalar",
     "cut_at_jumps",
@@ -82,6 +83,7 @@ __all__ = [
     "Part",
     "PARTS",
     "relaxed",
+    "rounded_comparison",
     "ROWS",
     "selected",
     "sources",

@@ -5,7 +5,8 @@ In continuous time such a jump is no hindrance: what the model says at the one t
 horizon is cut into equal pieces that have the jumps at their ends, and what jumps becomes an input with a value a
 piece, as the rows of an array plan are.
 
-A time is read as the decimal number that it is written as (the shortest one that names its float): 0.3 is 3/10.
+A number is the float that it is read as, exactly: everything here is computed in fractions. The ends of equal pieces
+may miss a jump by rounding (0.3 is no tenth of a second): a `Change` says when the function really jumps, and to what.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import NamedTuple
 
 from certbound.problem.model.analysis import reads
 from certbound.problem.model.graph import Graph
@@ -23,6 +25,7 @@ from certbound.problem.model.tape import JUMPS, Node, Tape
 _MOST_JUMPS = 500
 _MOST_PIECES = 1000
 _MOST_BENT = 100  # pieces for the sake of bends, which engines can do without
+_NEAR = Fraction(1, 2**48)  # share of the horizon by which a jump may miss the end of its piece; engines pay for it
 _CHOICE = "if_else_zero"
 _TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}  # 0 or 1
 _BENDS = frozenset({"min", "max", "abs"})
@@ -33,17 +36,31 @@ Line = tuple[Fraction, Fraction]
 _NOTHING: Line = (Fraction(0), Fraction(0))
 
 
+class Change(NamedTuple):
+    """What happens about the end of an equal piece: rows change from ``first`` to ``last``, exact times.
+
+    In between and beside them every input lies in ``low`` to ``high``.
+    """
+
+    first: Fraction
+    last: Fraction
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TimeJumps:
     """A function whose jumps at known times are inputs.
 
     ``tape`` has the inputs ``names`` behind the first ``1 + states`` of the function; ``rows`` holds their values on
-    equal pieces of the horizon, a row a piece.
+    equal pieces of the horizon, a row a piece, up to what the ``changes`` at 0, between two pieces and at the horizon
+    miss their ends by.
     """
 
     tape: Tape
     names: tuple[str, ...]
     rows: tuple[tuple[float, ...], ...]
+    changes: tuple[Change, ...] = ()
 
 
 def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
@@ -65,7 +82,7 @@ def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
     straight = [index for index in own if tape.nodes[index].op not in _BENDS]
     for kept, ops, most in ((own, _CUT, _MOST_BENT), (straight, JUMPS, _MOST_PIECES)):
         if any(tape.nodes[index].op in ops and found[index] for index in kept):
-            cut = _cut(tape, states, decimal(horizon), kept, most)
+            cut = _cut(tape, states, Fraction(horizon), kept, most)
             if cut is not None:
                 return cut
     return None
@@ -74,14 +91,15 @@ def cut_at_jumps(tape: Tape, states: int, horizon: float) -> TimeJumps | None:
 def between_jumps(tape: Tape, states: int, horizon: float) -> list[tuple[float, Tape]]:
     """The function from one of its jumps that t alone decides to the next: the end of each piece, and its tape.
 
-    One piece where it has none, or too many. The arguments are those of `cut_at_jumps`.
+    One piece where it has none, or too many, or jumps at a time that is no float. The arguments are those of
+    `cut_at_jumps`.
     """
     straight = [index for index in _timed(tape) if tape.nodes[index].op not in _BENDS]
     if not any(tape.nodes[index].op in JUMPS for index in straight) or math.isinf(horizon):
         return [(float(horizon), tape)]
-    known = _known(tape, straight, decimal(horizon))
+    known = _known(tape, straight, Fraction(horizon))
     cut = None if known is None else _with_inputs(tape, states, known[1], every=True)
-    if known is None or cut is None:
+    if known is None or cut is None or any(Fraction(float(end)) != end for end in known[0]):
         return [(float(horizon), tape)]
     found = []
     for end, row in zip(known[0][1:], cut.rows):
@@ -104,13 +122,32 @@ def _cut(tape: Tape, states: int, horizon: Fraction, own: Sequence[int], most: i
     if known is None:
         return None
     breaks, values = known
-    count = math.lcm(*((end / breaks[-1]).denominator for end in breaks))
+    shares = [(end / horizon).limit_denominator(most) for end in breaks]
+    if any(abs(share * horizon - end) > _NEAR * horizon for share, end in zip(shares, breaks)):
+        return None
+    count = math.lcm(*(share.denominator for share in shares))
     if count > most:
         return None
-    middles = [(Fraction(2 * k + 1, 2 * count)) * breaks[-1] for k in range(count)]
-    places = [sum(end < middle for end in breaks) - 1 for middle in middles]
-    rows = {index: [row[place] for place in places] for index, row in values.items()}
-    return _with_inputs(tape, states, rows, every=count == 1 and _touches(tape, own, breaks[-1]))
+    found = _with_inputs(tape, states, values, every=count == 1 and _touches(tape, own, horizon))
+    return None if found is None else _on_pieces(found, count, breaks, [int(share * count) for share in shares])
+
+
+def _on_pieces(found: TimeJumps, count: int, breaks: Sequence[Fraction], nearest: Sequence[int]) -> TimeJumps:
+    """Rows between breaks as rows on ``count`` equal pieces, and what happens about their ends, to which each break is
+    ``nearest``."""
+    rows, changes, horizon = [], [], breaks[-1]
+    inner = range(1, len(breaks) - 1)
+    for edge in range(count + 1):
+        own = [place for place in inner if nearest[place] == edge]
+        before = sum(nearest[place] < edge for place in inner)
+        beside = [found.rows[place] for place in range(before, before + len(own) + 1)]
+        times = [breaks[place] for place in own] or [horizon * edge / count]
+        if own and edge in (0, count):  # what holds before, or after, lies in between
+            times = [Fraction(0), *times] if edge == 0 else [*times, horizon]
+        low, high = (tuple(pick(column) for column in zip(*beside)) for pick in (min, max))
+        changes.append(Change(times[0], times[-1], low, high))
+        rows.append(beside[-1])
+    return replace(found, rows=tuple(rows[:-1]), changes=tuple(changes))
 
 
 def _known(
@@ -122,11 +159,6 @@ def _known(
         return None
     values = _values(tape, own, breaks)
     return breaks, {index: values[index] for index in _frontier(tape, values) if found[index]}
-
-
-def decimal(value: float) -> Fraction:
-    """The decimal number that a float is written as."""
-    return Fraction(repr(float(value)))
 
 
 def _breaks(tape: Tape, own: Sequence[int], horizon: Fraction) -> list[Fraction] | None:
@@ -155,13 +187,13 @@ def _jumps_within(tape: Tape, own: Sequence[int], first: Fraction, last: Fractio
 
 
 def _touches(tape: Tape, own: Sequence[int], horizon: Fraction) -> bool:
-    """Whether something jumps at time 0 or at the end: inside of the closed piece nothing decides it there."""
+    """Whether something jumps next to time 0 or the end: inside of the closed piece rounded times decide nothing."""
     lines: dict[int, Line | None] = {}
     for index in own:
         node = tape.nodes[index]
         if node.op in _CUT and all(lines.get(arg) is not None for arg in node.args):
             around = _crossings(node.op, _compared(node, lines), Fraction(-1), horizon + 1)
-            if not {Fraction(0), horizon}.isdisjoint(around):
+            if any(abs(time - end) <= _NEAR * horizon for time in around for end in (0, horizon)):
                 return True
         lines[index] = _line(node, lines, horizon / 2)
     return False
@@ -193,7 +225,7 @@ def _line(node: Node, lines: Mapping[int, Line | None], middle: Fraction) -> Lin
     A jump has its value at the middle, a bend the argument that it has there.
     """
     if node.op == "const":
-        return Fraction(0), decimal(node.value)
+        return Fraction(0), Fraction(node.value)
     if node.op == "input":
         return Fraction(1), Fraction(0)
     given = [line for line in (lines.get(arg) for arg in node.args) if line is not None]

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import numpy as np
@@ -24,7 +26,7 @@ class UntraceableError(TypeError):
 
 _BRANCH = (
     "a traced value has no truth value, so `if`, `while`, `and`, `or`, `not`, max() and min() cannot act on "
-    "it, nor can a comparison of arrays made by np.array; use np.where(x[0] > 0, a, b), np.maximum, "
+    "it; use np.where(x[0] > 0, a, b), np.maximum, "
     "np.minimum, or `&`, `|`, `~`"
 )
 _FLOAT = (
@@ -212,6 +214,14 @@ def _plain(value: Any) -> Any:
     return value
 
 
+_as_array = np.asarray  # which `traced_arrays` replaces
+
+
+def _objects(value: Any) -> np.ndarray[Any, np.dtype[Any]]:
+    array: np.ndarray[Any, np.dtype[Any]] = _as_array(_plain(value), dtype=object)
+    return array
+
+
 def _wrapped(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype == object:
         return value[()] if value.ndim == 0 else value.view(Traced)
@@ -228,7 +238,7 @@ def _ufunc(ufunc: np.ufunc, method: str, inputs: tuple[Any, ...], kwargs: dict[s
     if method == "__call__" and function is not None and not set(kwargs) - {"dtype", "casting"}:
         result = _elementwise(function, *inputs)
     elif method == "__call__" and name in ("matmul", "vecdot", "matvec", "vecmat") and not kwargs:
-        result = _wrapped(ufunc(*(np.asarray(_plain(value), dtype=object) for value in inputs)))
+        result = _wrapped(ufunc(*(_objects(value) for value in inputs)))
     elif method == "reduce" and name in ("add", "multiply", "maximum", "minimum"):
         result = _reduced(FUNCTIONS[name], inputs[0], **kwargs)
     else:
@@ -249,7 +259,7 @@ def _reduced(
     initial: Any = None,
     **_: Any,
 ) -> Any:
-    array = np.asarray(_plain(value), dtype=object)
+    array = _objects(value)
     axes = tuple(range(array.ndim)) if axis is None else tuple(np.atleast_1d(axis) % array.ndim)
     kept = [k for k in range(array.ndim) if k not in axes]
     flat = array.transpose(*kept, *axes).reshape([array.shape[k] for k in kept] + [-1])
@@ -297,6 +307,43 @@ def _clip_function(a: Any, a_min: Any = None, a_max: Any = None, **kwargs: Any) 
 def _boxed(value: Any) -> Any:
     """None as an element of an object array."""
     return np.full((), None, dtype=object) if value is None else value
+
+
+_MAKERS = ("array", "asarray", "asanyarray")
+_REPLACED: list[dict[str, Any]] = []
+_LOCK = threading.Lock()
+
+
+@contextmanager
+def traced_arrays() -> Iterator[None]:
+    """Within it np.array([x, y]) of traced scalars is a traced array, as np.stack makes one.
+
+    NumPy asks its protocols nothing in these functions, so they are replaced while a model is called; what they make of
+    anything else stays as it is, in other threads too.
+    """
+    with _LOCK:
+        _REPLACED.append({name: getattr(np, name) for name in _MAKERS})
+        if len(_REPLACED) == 1:
+            for name, maker in _REPLACED[0].items():
+                setattr(np, name, _tracing(maker))
+    try:
+        yield
+    finally:
+        with _LOCK:
+            kept = _REPLACED.pop()
+            if not _REPLACED:
+                for name, maker in kept.items():
+                    setattr(np, name, maker)
+
+
+def _tracing(maker: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(maker)
+    def make(*args: Any, **kwargs: Any) -> Any:
+        made = maker(*args, **kwargs)
+        plain = type(made) is np.ndarray and made.dtype == object
+        return made.view(Traced) if plain and any(isinstance(entry, Scalar) for entry in made.flat) else made
+
+    return make
 
 
 def _install() -> None:

@@ -1,4 +1,4 @@
-"""From a NumPy-style Python function to a tape, and the tools that every reader of a tape shares."""
+"""From a NumPy-style Python function to a tape; and calling a network, on numbers and arrays or on traced values."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from certbound.problem.model import network_rows
 from certbound.problem.model.graph import Graph
+from certbound.problem.model.network_data import Network, Part
+from certbound.problem.model.networks_found import with_layers
 from certbound.problem.model.tape import Tape
-from certbound.problem.model.tracer import Scalar, Traced, UntraceableError
+from certbound.problem.model.tracer import Scalar, Traced, UntraceableError, traced_arrays
 
 
 def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) -> Tape:
@@ -73,7 +76,8 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, Sequence[str]]) 
         values |= scalars
     chosen = {key: values[key] for key in names}
     try:
-        result = function(**chosen)
+        with traced_arrays():
+            result = function(**chosen)
     except UntraceableError as error:
         raise TypeError(f"`{name}` cannot be traced{_place(error)}: {error}.") from error
     except (TypeError, AttributeError) as error:
@@ -160,7 +164,7 @@ def _finish(graph: Graph, result: Any, name: str) -> Tape:
             raise ValueError(
                 f"`{name}` must return finite numbers, got {entry!r} at position {place}."
             ) from error
-    return graph.tape(outputs, array.shape or (1,))
+    return with_layers(graph.tape(outputs, array.shape or (1,)))
 
 
 def _collected(result: Any, name: str) -> np.ndarray[Any, np.dtype[Any]]:
@@ -183,3 +187,54 @@ def _listed(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist() if value.dtype != object else _listed(list(value) if value.ndim else value[()])
     return [_listed(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def call_network(network: Network, *args: Any) -> Any:
+    """The outputs of a network.
+
+    Parameters
+    ----------
+    network : Network
+        With n inputs and p outputs.
+    *args : array_like
+        One array (..., n), or n numbers or arrays that broadcast; traced values in a traced function.
+
+    Returns
+    -------
+    ndarray, shape (..., p)
+        Traced, where an argument is.
+
+    Raises
+    ------
+    ValueError
+        If there are not n inputs.
+    """
+    plain = [arg.view(np.ndarray) if isinstance(arg, Traced) else arg for arg in args]
+    whole = len(plain) == 1 and not isinstance(plain[0], Scalar) and np.ndim(plain[0]) > 0
+    entries = list(np.moveaxis(np.asarray(plain[0]).view(np.ndarray), -1, 0)) if whole else plain
+    if len(entries) != network.inputs:
+        raise ValueError(f"`{network.name}` takes {network.inputs} numbers, got {len(entries)}.")
+    graph = next((entry.graph for entry in _flat(entries) if isinstance(entry, Scalar)), None)
+    if graph is None:
+        columns = [network_rows.numpy(*entries, Part(network, output)) for output in range(network.outputs)]
+        return np.stack(np.broadcast_arrays(*columns), axis=-1)
+    if any(np.ndim(entry) for entry in entries if not isinstance(entry, Scalar)):
+        raise UntraceableError(f"{network.name} takes one vector of traced values at a time, or numbers one by one")
+    nodes = tuple(_node(graph, entry) for entry in entries)
+    result = np.empty(network.outputs, dtype=object)
+    for output in range(network.outputs):
+        result[output] = Scalar(graph, graph.part(Part(network, output), nodes))
+    return result.view(Traced)
+
+
+def _flat(entries: list[Any]) -> list[Any]:
+    return [part for entry in entries for part in (entry.reshape(-1) if isinstance(entry, np.ndarray) else [entry])]
+
+
+def _node(graph: Graph, entry: Any) -> int:
+    entry = entry[()] if isinstance(entry, np.ndarray) else entry
+    if isinstance(entry, Scalar):
+        if entry.graph is not graph:
+            raise UntraceableError("a network meets values of two traced calls")
+        return entry.index
+    return graph.const(float(entry))

@@ -22,7 +22,7 @@ class Inside:
     Parameters
     ----------
     region : Box, Ball, Ellipsoid, HalfSpace, Polytope or another Region
-        Closed set.
+        Closed set: a state on its boundary is in it, safe where it is to be stayed in, failed where it is an obstacle.
     during : (float, float), optional
         First and last time (step) at which the constraint holds; the whole horizon when omitted, and (T, T)
         makes it a terminal one.
@@ -36,6 +36,8 @@ class Inside:
 
     word: ClassVar[str] = "inside"
     outside: ClassVar[bool] = False
+    without_edge: ClassVar[bool] = False
+    """Whether a state on the boundary of the region has failed, although the region is one to stay in."""
 
     def __post_init__(self) -> None:
         if Region not in type(self.region).__bases__:  # a class made from a shape may mean something else
@@ -65,6 +67,10 @@ class Inside:
         the face has failed: either set lies in what is left, and failing on a larger set is no less probable. Windows
         stay as they are, and so do centers that move.
         """
+        return self
+
+    def closed(self) -> Inside:
+        """The same constraint, satisfied on the boundary of its region too."""
         return self
 
     def inward(self, side: int, place: float) -> float:
@@ -103,6 +109,11 @@ class Outside(Inside):
 @dataclass(frozen=True, eq=False)
 class Open(Inside):
     """The state stays in the interior of a region: what a half-space to keep out of leaves."""
+
+    without_edge: ClassVar[bool] = True
+
+    def closed(self) -> Inside:
+        return Inside(self.region, during=self.during, label=self.label)
 
     def inward(self, side: int, place: float) -> float:
         return _next(side, place)

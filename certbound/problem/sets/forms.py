@@ -97,6 +97,16 @@ class Quadratic:
         """W with the set equal to {|W y| <= radius}, in floating point."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.shape)))
 
+    @cached_property
+    def test(self) -> tuple[Array, float]:
+        """(W, rho) with the set equal to {|W y| <= rho}, in floating point.
+
+        In units of the largest half-axis along a coordinate: points on the edge of an ellipsoid whose half-axes are
+        floats are mostly found there.
+        """
+        longest = float(np.sqrt(np.diag(self.shape).max()))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.shape) / longest)), longest * self.radius
+
     def hull(self) -> Interval:
         """A box around the set, rounded outward."""
         reach = Interval.point(np.full(self.dimension, self.radius))
@@ -203,7 +213,8 @@ class Region:
     def _holds(self, y: Array) -> Mask:
         match self.form:
             case Quadratic() as form:
-                return np.asarray(np.linalg.norm(y @ form.root.T, axis=-1) <= form.radius)
+                matrix, radius = form.test
+                return np.asarray(np.linalg.norm(y @ matrix.T, axis=-1) <= radius)
             case Faces() as form:
                 return np.asarray(np.all(y @ form.normals.T <= form.bounds, axis=-1))
 

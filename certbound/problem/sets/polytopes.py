@@ -14,14 +14,15 @@ from certbound.problem.sets.forms import Faces, Region, linear_maximum
 from certbound.problem.sets.regions import Polytope
 
 _SLACK = 2.0**-48
-"""Rounding of a computed face, in units of the numbers that it is computed from."""
+"""Rounding of a side that floats do not compute exactly, in units of the numbers that it is computed from."""
 
 
 def polygon(vertices: ArrayLike, *, places: Sequence[int] = (0, 1), dimension: int = 2, outward: bool) -> Polytope:
     """The convex polygon with these corners, in two of the states, as a polytope over all of them.
 
     Proves: the polytope contains the polygon (``outward``: for what is to be avoided), or lies in it (for what is to be
-    stayed in or reached); between the two lie a few units of rounding.
+    stayed in or reached). A side lies exactly where its corners put it where floats compute it without rounding;
+    elsewhere a few units of rounding lie between the two.
 
     Parameters
     ----------
@@ -56,13 +57,23 @@ def polygon(vertices: ArrayLike, *, places: Sequence[int] = (0, 1), dimension: i
     normals, bounds, size = [], [], float(np.abs(points).max())
     for (x0, y0), (x1, y1) in zip(points, np.roll(points, -1, axis=0)):
         normal = np.array([y1 - y0, x0 - x1])
-        reach = float(max(normal @ [x0, y0], normal @ [x1, y1]))
-        slack = _SLACK * size * float(np.abs(normal).sum())
         row = np.zeros(dimension)
         row[list(places)] = normal
         normals.append(row)
-        bounds.append(reach + slack if outward else reach - slack)
+        bounds.append(_bound(normal, [(x0, y0), (x1, y1)], size, outward))
     return Polytope(np.array(normals), np.array(bounds))
+
+
+def _bound(normal: Array, ends: list[tuple[float, float]], size: float, outward: bool) -> float:
+    """The bound of a side between two corners: exact where floats compute it exactly, else moved to one side."""
+    (x0, y0), (x1, y1) = corners = _exactly(np.array(ends))
+    along, across = map(Fraction, normal.tolist())
+    found = [float(normal @ np.array(end)) for end in ends]
+    held = (along, across) == (y1 - y0, x0 - x1)
+    if held and all(along * x + across * y == Fraction(value) for (x, y), value in zip(corners, found)):
+        return max(found)
+    slack = _SLACK * size * float(np.abs(normal).sum())
+    return max(found) + slack if outward else max(found) - slack
 
 
 def _exactly(points: Array) -> list[tuple[Fraction, Fraction]]:
@@ -115,11 +126,18 @@ def intersection(parts: Sequence[Region], *, dimension: int, outward: bool) -> P
                 "polygon around it (or inside it, for what is to be stayed in or reached)."
             )
         center = part.center_at()
-        shift = form.normals @ center
+        moved = form.bounds + form.normals @ center
         slack = _SLACK * (np.abs(form.normals) @ np.abs(center)) * (1.0 if outward else -1.0)
+        held = [_adds_up(*numbers, center) for numbers in zip(moved, form.bounds, form.normals)]
         normals.append(part.lifted(form.normals, dimension))
-        bounds.append(np.where(shift == 0, form.bounds, form.bounds + shift + slack))
+        bounds.append(np.where(held, moved, moved + slack))
     faces, ends = np.concatenate(normals), np.concatenate(bounds)
     if linear_maximum(faces, ends, np.zeros(dimension)) is None:
         raise ValueError("`all` must hold sets with a point in common, and these have none.")
     return Polytope(faces, ends)
+
+
+def _adds_up(found: float, bound: float, normal: Array, center: Array) -> bool:
+    """Whether a float is bound + normal.center to the last digit."""
+    products = (Fraction(a) * Fraction(b) for a, b in zip(normal.tolist(), center.tolist()))
+    return Fraction(float(found)) == sum(products, Fraction(float(bound)))

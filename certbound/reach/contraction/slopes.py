@@ -34,7 +34,7 @@ class LocalSlopes:
     def boxes(self, curve: Curve, radius: Array) -> Interval:
         """Boxes of all input slots that hold p + {||y||_P <= radius} over each piece, (B, K, slots)."""
         grown = Interval.point(radius)[..., None] * self._dual * Interval(-1.0, 1.0)
-        return self.flow.slots(curve.times, curve.range() + grown, self.flow.plan_rows(curve.starts))
+        return self.flow.slots(curve.times, curve.range() + grown, self.flow.plan_ranges(curve.starts))
 
     def bound(self, curve: Curve, radius: Array) -> Array:
         """Upper bounds over p + {||y||_P <= radius} and all of D, shape (B, K); +inf where nothing is proved.

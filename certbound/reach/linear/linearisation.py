@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from fractions import Fraction
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
-from certbound.gaussian.response import LinearResponse, balanced, continuous_response, discrete_response
+from certbound.gaussian.response import (
+    LinearResponse,
+    StepEvents,
+    balanced,
+    continuous_response,
+    discrete_response,
+)
 from certbound.problem.model import Tape, compile_numpy, compile_scalar
+from certbound.problem.noise import BoxLaw
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem
+from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.reach.linear.inclusion import Gathering, Supports, gathering_of
 from certbound.reach.nominal import Cells, initial_cells
 from certbound.reach.remainder import Frame, Remainder
@@ -306,6 +315,14 @@ class Linearisation:
         bound = 8 * (len(proxy) + 2) * 2.0**-53 * float((np.abs(g) @ np.abs(proxy) @ np.abs(g).T).max(initial=0.0))
         return discrete_response(slope, covariance, bound, start, slope_error=self.slope_error)
 
+    def step_events(self, cell: int) -> StepEvents:
+        """Scalar events of one cell in discrete time."""
+        assert isinstance(self.system, DiscreteSystem)
+        law = self.system.noise
+        still = isinstance(law, BoxLaw) and not np.any(self.start_covariance)
+        bounded = (self.system.noise_matrix, law.bound) if still and law.bound is not None else None
+        return StepEvents(self.response, cell, bool(law.gaussian), bounded)
+
     @property
     def _slope_slack(self) -> Interval:
         return self.model.constant_slope - self.model.constant_slope.mid
@@ -350,8 +367,29 @@ class Linearisation:
             velocity=velocity, middle_acceleration=middle_acceleration, acceleration=acceleration, jerk=jerk,
             slope=middle_slope, drift=flat(drift), input_gain=flat(gain),
             inputs=np.tile(self.inputs, (cells, 1)), disturbance_middle=self.d_middle,
-            disturbance_low=self.d_low, disturbance_high=self.d_high,
+            disturbance_low=self.d_low, disturbance_high=self.d_high, **self._beside,
         )
+
+    @property
+    def _beside(self) -> dict[str, Any]:
+        """What a frame holds of rows that do not change just at the ends of their pieces."""
+        changes, count = self.problem.changes, self.pieces
+        if changes is None:
+            return {}
+        horizon, rows = Fraction(self.problem.horizon), len(changes) - 1
+        ends = [horizon * edge / rows for edge in range(rows + 1)]
+        missed = [max(one.last, end) - min(one.first, end) for one, end in zip(changes, ends)]
+        if not any(missed):
+            return {}
+        low, high, own = self.inputs.copy(), self.inputs.copy(), len(changes[0].low)
+        for edge, (change, miss) in enumerate(zip(changes, missed)):
+            place = edge * (count // rows)
+            for piece in (place - 1, place):
+                if miss and 0 <= piece < count:
+                    low[piece, :own] = np.minimum(low[piece, :own], change.low)
+                    high[piece, :own] = np.maximum(high[piece, :own], change.high)
+        beside = Interval(np.tile(low, (self.cells, 1)), np.tile(high, (self.cells, 1)))
+        return {"beside": beside, "part": float(2 * max(missed) * count / horizon) * (1 + 1e-12)}
 
     @cached_property
     def sizes(self) -> Array:

@@ -43,6 +43,11 @@ class LinearAnswer:
         return float(min(value + 1e-15 * abs(value), 0.0))
 
     @property
+    def impossible(self) -> bool:
+        """Whether the probability is 0, or too small to be told from it."""
+        return bool(self.outcome.log_probability / np.log(10.0) <= answer_tubes.LEAST)
+
+    @property
     def engine(self) -> Linearisation:
         """The linearisation of all cells, which certificates start from."""
         return self.run.engine
@@ -105,6 +110,8 @@ class LinearAnswer:
         asked, logs = self.run.requirements[self.outcome.cell], self.outcome.logs
         if not asked or len(logs) != len(asked) or self.log10_delta >= 0:
             return f"the noise takes more than the room of '{self.constraint}' at t = {self.time:.4g}"
+        if self.impossible:
+            return f"no noise that there can be takes all the room of '{self.constraint}', where it is least"
         worst = int(np.argmax(logs))
         part = f"{log10_text(min(logs[worst] / np.log(10.0), 0.0))} for '{asked[worst].label}'"
         left = log10_text(min(self.outcome.nonlinear.log / np.log(10.0), 0.0))

@@ -93,7 +93,7 @@ class LinearRun(Inclusion):
             diffusion = engine.diffusion if engine.diffusion.ndim == 2 else engine.diffusion[cell]
             return ClockEvents(windows, diffusion, kept)
         if cell not in self.steps:
-            self.steps[cell] = StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
+            self.steps[cell] = engine.step_events(cell)
         return self.steps[cell]
 
     def levels(self, nonlinear: Share) -> tuple[Array, list[Events]]:

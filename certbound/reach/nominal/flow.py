@@ -7,8 +7,10 @@ piece.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
@@ -60,20 +62,53 @@ class Flow:
 
     @cached_property
     def breaks(self) -> Array:
-        """Times where the plan jumps, 0 and the horizon included (continuous time)."""
-        sequence = self.problem.input_sequence
-        count = 1 if sequence is None else len(sequence)
-        return np.linspace(0.0, self.horizon, count + 1)
+        """Times where the plan jumps, 0 and the horizon included (continuous time).
+
+        Where it is not said to jump at a float, it does between two neighbouring ones, and both are among them.
+        """
+        sequence, changes = self.problem.input_sequence, self.problem.changes
+        if changes is None:
+            count = 1 if sequence is None else len(sequence)
+            return np.linspace(0.0, self.horizon, count + 1)
+        ends = [end for change in changes for end in _around(change.first, change.last)]
+        return np.unique(np.clip([0.0, *ends, self.horizon], 0.0, self.horizon))
+
+    @cached_property
+    def _pieces(self) -> tuple[Array, Array, Array]:
+        """Rows between `breaks`, one of those that hold there, and the least and largest of them."""
+        sequence, changes = self.problem.input_sequence, self.problem.changes
+        assert sequence is not None
+        rows = np.asarray(sequence, dtype=float)
+        if changes is None:
+            return rows, rows, rows
+        around = [_around(change.first, change.last) for change in changes]
+        own = rows[np.searchsorted([last for _, last in around[1:-1]], self.breaks[:-1], side="right")]
+        low, high = own.copy(), own.copy()
+        for change, (first, last) in zip(changes, around):
+            inside = (self.breaks[:-1] >= first) & (self.breaks[1:] <= last)
+            low[inside] = np.minimum(low[inside], change.low)
+            high[inside] = np.maximum(high[inside], change.high)
+        return own, low, high
+
+    def _index(self, starts: ArrayLike) -> Array:
+        times = np.asarray(starts, dtype=float)
+        index = np.searchsorted(self.breaks, times, side="right") - 1 if self.continuous else times.astype(int)
+        return np.clip(index, 0, len(self._pieces[0]) - 1)
 
     def plan_rows(self, starts: ArrayLike) -> Array:
         """Inputs of the array plan on the pieces (or steps) that begin at ``starts``, shape (K, m)."""
-        sequence = self.problem.input_sequence
-        times = np.asarray(starts, dtype=float)
-        if sequence is None:
-            return np.zeros((len(times), 0))
-        index = np.searchsorted(self.breaks, times, side="right") - 1 if self.continuous else times.astype(int)
-        rows: Array = np.asarray(sequence, dtype=float)[np.clip(index, 0, len(sequence) - 1)]
+        if self.problem.input_sequence is None:
+            return np.zeros((len(np.asarray(starts)), 0))
+        rows: Array = self._pieces[0][self._index(starts)]
         return rows
+
+    def plan_ranges(self, starts: ArrayLike) -> Interval:
+        """Enclosure of them: of more than one row only where the plan jumps between two neighbouring floats."""
+        if self.problem.input_sequence is None:
+            return Interval.point(self.plan_rows(starts))
+        _, low, high = self._pieces
+        index = self._index(starts)
+        return Interval(low[index], high[index])
 
     @cached_property
     def disturbance(self) -> Interval:
@@ -106,7 +141,7 @@ class Flow:
         return compile_numpy(self.tape)(*slots)
 
     def bounds(
-        self, tape: Tape, times: Interval, states: Interval, rows: Array, disturbance: Interval | None = None
+        self, tape: Tape, times: Interval, states: Interval, rows: Interval, disturbance: Interval | None = None
     ) -> Interval:
         """Enclosure of ``tape`` (f or one of its Jacobians) over boxes; [-inf, inf] where undefined.
 
@@ -114,7 +149,7 @@ class Flow:
         ----------
         times : Interval, shape (K,)
         states : Interval, shape (..., K, n)
-        rows : ndarray, shape (K, m)
+        rows : Interval, shape (K, m)
         disturbance : Interval, shape (..., q), optional
             The whole set D when omitted.
         """
@@ -122,22 +157,29 @@ class Flow:
         return enclose(tape, [slots[..., i] for i in range(slots.shape[-1])], undefined="infinite")
 
     def slots(
-        self, times: Interval, states: Interval, rows: Array, disturbance: Interval | None = None
+        self, times: Interval, states: Interval, rows: Interval, disturbance: Interval | None = None
     ) -> Interval:
         """Boxes of all input slots, shape (..., K, slots), from the parts that `bounds` takes."""
         d = self.disturbance if disturbance is None else disturbance
         parts = [times, *(states[..., i] for i in range(self.dimension))]
-        parts += [Interval.point(rows[..., i]) for i in range(rows.shape[-1])]
+        parts += [rows[..., i] for i in range(rows.shape[-1])]
         parts += [d[..., i] for i in range(d.shape[-1])]
         batch = np.broadcast_shapes(*(part.shape for part in parts))
         return stack([part.broadcast_to(batch) for part in parts], axis=-1)
 
-    def expand(self, times: Series, states: Sequence[Series], rows: Array, order: int) -> list[Series]:
+    def expand(self, times: Series, states: Sequence[Series], rows: Interval, order: int) -> list[Series]:
         """Series of f at d0 along series of time and states."""
         slots = [times, *states]
-        slots += [[Interval.point(rows[..., i])] for i in range(rows.shape[-1])]
+        slots += [[rows[..., i]] for i in range(rows.shape[-1])]
         slots += [[Interval.point(value)] for value in self.centre_disturbance]
         return expand(self.tape, slots, order)
+
+
+def _around(first: Fraction, last: Fraction) -> tuple[float, float]:
+    """The floats next to the two, outwards."""
+    low, high = float(first), float(last)
+    low = low if Fraction(low) <= first else math.nextafter(low, -math.inf)
+    return low, high if Fraction(high) >= last else math.nextafter(high, math.inf)
 
 
 def _columns(values: Array) -> list[Array]:

@@ -31,6 +31,7 @@ PIECES = 128  # at least, where the grid is chosen
 ROUNDS = 5
 LARGEST_GRID = 4096
 MOST_EVALUATIONS = 400_000
+_NO_TIME = 2.0**-44  # share of the horizon in which the solver leaves states as they are
 PATIENCE, LEAST_PROGRESS = 5000, 1e-4
 """Evaluations within which the solver must advance, and by which share of the time."""
 
@@ -66,7 +67,7 @@ def nominal_curve(problem: Problem | Flow, points: ArrayLike, *, times: ArrayLik
         coarse = _estimate_defect(flow, curve) > _tolerance(curve)
         if not np.any(coarse) or len(grid) > LARGEST_GRID:
             break
-        grid = np.sort(np.concatenate([grid, (grid[:-1] + (grid[1:] - grid[:-1]) / 2)[coarse]]))
+        grid = np.unique(np.concatenate([grid, (grid[:-1] + (grid[1:] - grid[:-1]) / 2)[coarse]]))
     return curve
 
 
@@ -92,7 +93,7 @@ def bound_defect(flow: Flow, curve: Curve) -> Interval:
     Proves: the difference lies in the returned box at every t of the piece, both ends included. Pieces on
     which the closed loop is undefined get [-inf, inf].
     """
-    rows = flow.plan_rows(curve.starts)
+    rows = flow.plan_ranges(curve.starts)
     d0 = Interval.point(flow.centre_disturbance)
     if not curve.continuous:
         points = curve.range()
@@ -117,7 +118,7 @@ def defect_series(
     flow: Flow, curve: Curve, order: int = ORDER
 ) -> tuple[list[list[Interval]], list[list[Interval]]]:
     """Series of p' - f(p, d0, t) at the middles and over the pieces, one per state (continuous time)."""
-    rows = flow.plan_rows(curve.starts)
+    rows = flow.plan_ranges(curve.starts)
     one = Interval.point(1.0)
     results = []
     for times, states in (
@@ -141,7 +142,7 @@ def bound_disturbance_slope(flow: Flow, curve: Curve) -> Interval:
     Proves: f(p, d, t) - f(p, d0, t) lies in E (d - d0) for every t of the piece (mean-value theorem on the
     segment from d0 to d).
     """
-    rows = flow.plan_rows(curve.starts)
+    rows = flow.plan_ranges(curve.starts)
     return flow.bounds(flow.disturbance_jacobian, curve.times, curve.range(), rows)
 
 
@@ -212,6 +213,9 @@ def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
     nodes[:, 0] = states
     segments = np.unique(np.searchsorted(grid, flow.breaks))
     for first, last in itertools.pairwise(segments):
+        if grid[last] - grid[first] <= _NO_TIME * flow.horizon:
+            nodes[:, first : last + 1] = nodes[:, first : first + 1]
+            continue
         row = flow.plan_rows(grid[first : first + 1])[0]
         patience = _Patience(flow, float(grid[last] - grid[first]))
 
@@ -242,7 +246,7 @@ def _acceleration(flow: Flow, times: Array, states: Array, velocity: Array, rows
     if not np.all(np.isfinite(velocity)):
         return np.full(states.shape, np.nan)
     moving = [[Interval.point(x[..., i]) for x in (states, velocity)] for i in range(flow.dimension)]
-    series = flow.expand([Interval.point(times), Interval.point(1.0)], moving, rows, 1)
+    series = flow.expand([Interval.point(times), Interval.point(1.0)], moving, Interval.point(rows), 1)
     return np.stack([np.broadcast_to(s[1].mid, states.shape[:-1]) for s in series], axis=-1)
 
 

@@ -107,6 +107,9 @@ class Remainder(Derivatives):
         count = len(self.active)
         expansion = self._expansion(frame)
         extra = self._disturbance(frame, low[:, :count], high[:, :count]) if self.gain is not None else None
+        jumped = self._jumped(frame, low[:, :count], high[:, :count])
+        if jumped is not None:
+            extra = jumped if extra is None else extra + jumped
         if target is not None and extra is not None:
             target = target[0] - extra.lo, target[1] - extra.hi
         inner = low[:, :count], high[:, :count]
@@ -153,16 +156,44 @@ class Remainder(Derivatives):
             point = [Interval.point(np.zeros(1))] * len(self.value.inputs)
             gain = enclose(selected(self.gain, list(range(n * q)), None), point).reshape(1, n, q)
         else:
-            shift, size = np.zeros(frame.spread.shape), frame.spread.copy()
-            shift[:, self.active] = (low + high) / 2
-            size[:, self.active] += (high - low) / 2 * (1 + 1e-12) + 1e-15 * (np.abs(low) + np.abs(high)) + 1e-300
-            size = size * (1 + 1e-15)
-            state = frame.middle + shift + Interval(-size, size)
+            state = self._whole_box(frame, low, high)
             widths = (frame.disturbance_low, frame.disturbance_high)
             slots = self.slots(frame.span, state, frame.inputs, frame.disturbance_middle, widths)
             gain = enclose(self.gain, slots, undefined="infinite").broadcast_to((len(frame), n, q))
         reach = Interval(frame.disturbance_low, frame.disturbance_high) - frame.disturbance_middle
         return ((gain - frame.input_gain) * reach[None, None, :]).sum(axis=-1)
+
+    def _whole_box(self, frame: Frame, low: Array, high: Array) -> Interval:
+        """The box of the states over a piece and the polytope, (M, n)."""
+        shift, size = np.zeros(frame.spread.shape), frame.spread.copy()
+        shift[:, self.active] = (low + high) / 2
+        size[:, self.active] += (high - low) / 2 * (1 + 1e-12) + 1e-15 * (np.abs(low) + np.abs(high)) + 1e-300
+        size = size * (1 + 1e-15)
+        return frame.middle + shift + Interval(-size, size)
+
+    def _jumped(self, frame: Frame, low: Array, high: Array) -> Interval | None:
+        """What rows that change beside the end of a piece add to beta there, spread over the whole piece; (M, n).
+
+        For the part tau of a piece beta lies within D of what the piece's own row gives, and its integral over the
+        piece within tau D: so much more of beta on all of it, tau D / h, has the same bounds, since the response is
+        bounded by integrals of |beta| (`Supports.remainder`). States that are not active add nothing to D.
+        """
+        own = frame.beside
+        if own is None:
+            return None
+        touched, n = np.flatnonzero((own.lo < own.hi).any(axis=1)), frame.spread.shape[1]
+        size = np.zeros((len(frame), n))
+        if len(touched):
+            part, some = frame.taken(touched), self._whole_box(frame, low, high)[touched]
+            widths = (frame.disturbance_low, frame.disturbance_high)
+            slots = self.slots(part.span, some, part.inputs, part.disturbance_middle, widths)
+            for place in range(part.inputs.shape[1]):
+                slots[1 + n + place] = own[touched][:, place]
+            values = enclose(self.value, slots, undefined="infinite").broadcast_to((len(touched), n))
+            with np.errstate(invalid="ignore"):
+                width = np.nextafter(values.hi - values.lo, np.inf) * frame.part
+            size[touched] = np.where(np.isfinite(width), np.nextafter(width, np.inf), np.inf)
+        return Interval(-size, size)
 
     def _together(self, expansion: Expansion, asked: _Asked) -> tuple[Array, Array]:
         """Bounds of all outputs over the boxes of each group."""

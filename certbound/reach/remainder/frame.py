@@ -33,12 +33,15 @@ class Frame:
     disturbance_middle: Array
     disturbance_low: Array
     disturbance_high: Array
+    beside: Interval | None = None  # inputs that rows of the plan may have on a part of the piece, where they jump
+    part: float = 0.0  # that part of its length, at the most
 
     def __len__(self) -> int:
         return len(self.spread)
 
     def taken(self, index: Integers) -> Frame:
         """Some of the pieces."""
-        whole = {"half", "disturbance_middle", "disturbance_low", "disturbance_high"}
+        whole = {"half", "part", "disturbance_middle", "disturbance_low", "disturbance_high"}
+        whole |= {"beside"} if self.beside is None else set()
         names = [entry.name for entry in fields(self) if entry.name not in whole]
         return replace(self, **{name: getattr(self, name)[index] for name in names})

@@ -40,6 +40,7 @@ SLACK = 0.01
 _NEAR = 0.9  # of the logarithm that the engine proved
 _LIKELY = -2.0  # log10 of a probability of which a per cent matters
 _LOG10 = math.log(10.0)
+_SMALLEST = -1e12  # log10 of a probability that is not told apart from 0
 
 
 def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
@@ -64,7 +65,7 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
             break
     if best is None:
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
-    log10 = best[1].log_probability / _LOG10
+    log10 = max(best[1].log_probability / _LOG10, _SMALLEST)
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
     slack = SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
     return proof_data(best[0].engine.problem, *best, cuts_of(answer)), min(log10 + slack, 0.0), []
@@ -128,7 +129,7 @@ def _events(run: LinearRun, cell: int, shared: Share) -> Events:
     engine = run.engine
     if isinstance(engine.system, ContinuousSystem):
         return WindowEvents(engine.response, cell, engine.window, shared.log)
-    return StepEvents(engine.response, cell, bool(engine.system.noise.gaussian))
+    return engine.step_events(cell)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -176,7 +177,9 @@ def _levels(run: LinearRun, nonlinear: Share) -> _Levels | None:
             event = own.along(run.rows[cell, :, d])
             if event.profile.max() > 0:
                 profile = np.maximum(event.profile, _LEAST * event.profile.max())
-                levels[cell, :, d] = level_scale(event, event.profile, share) * profile
+                found = level_scale(event, event.profile, share) * profile
+                capped = own.along(run.rows[cell, :, d]).capped if isinstance(own, StepEvents) else np.asarray
+                levels[cell, :, d] = capped(found)
             logs.append(math.log(2.0) + event.log_exceedance(levels[cell, :, d]))
         events.append(own)
         spent.append(logs)

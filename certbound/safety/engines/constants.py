@@ -25,7 +25,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.constants.bounds import bound_constants
 from certbound.constants.metrics import bound_metrics
-from certbound.constants.stated import proved_or_stated, refuse_contradiction
+from certbound.constants.stated import proved_or_stated, refuse_contradiction, refuse_jumps
 from certbound.display import log10_text, rounded
 from certbound.errors import CertboundError, EnclosureError, InfeasibleError
 from certbound.problem.jumps_as_plan import in_pieces
@@ -91,6 +91,9 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
     if constants is not None:
         refuse_contradiction(problem, constants)
         constants = proved_or_stated(problem, constants)
+        refusal = "" if constants.certified else _across_jumps(problem)
+        if refusal:
+            return EngineAnswer(applicable=False, reason=refusal, method="kummer" if method == "auto" else method)
     work = _Work(problem, asked)
     by_clearance, target = method in BY_CLEARANCE, math.log10(problem.delta)
     best: EngineAnswer | None = None
@@ -116,6 +119,15 @@ def constants_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswe
         return EngineAnswer(applicable=False, reason=reason, method=work.name)
     local = work.local_answer(reason)
     return local if best is None or (local.applicable and local.log10_delta < best.log10_delta) else best
+
+
+def _across_jumps(problem: Problem) -> str:
+    """Why constants that are stated say nothing of a model; empty where they do."""
+    try:
+        refuse_jumps(problem)
+    except EnclosureError as error:
+        return f"stated constants are slopes, which bound no jump and need a model that is defined: {error}"
+    return ""
 
 
 def _proposals(problem: Problem, *, quick: bool) -> Iterator[Constants]:
@@ -160,7 +172,7 @@ class _Work:
         start = random_start(self.problem, constants)
         if start != NO_START:
             constants = constants.with_full_dimension()
-        answer = EngineAnswer(reach=reach, constants=constants, method=self.name, assumption=_assumption(constants))
+        answer = EngineAnswer(reach=reach, constants=constants, method=self.name, assumption=self._assumed(constants))
         refused = self._refused(reach, erosion, answer)
         if refused is not None:
             return refused
@@ -252,6 +264,16 @@ class _Work:
                 yield cut, local_constants(self.problem, reach, np.maximum(room, 0.0), segments=self.segments)
             except (CertboundError, ValueError):
                 return
+
+    def _assumed(self, constants: Constants) -> str:
+        """Stated constants in words: their values, their norm, and where they hold; empty of proved ones."""
+        if constants.certified:
+            return ""
+        name, value = ("rate", constants.rate) if constants.continuous else ("gain", constants.gain)
+        norm = "the Euclidean norm" if constants.metric is None else "the norm of their metric"
+        where = "everywhere" if self.problem.domain is None else "on the domain"
+        numbers = f"{name} = {value}, sigma = {constants.sigma}, {where}, in {norm}"
+        return f"the stated constants ({numbers}) are assumed, not proved"
 
     def _refused(self, reach: ReachTube, erosion: Erosion, answer: EngineAnswer) -> EngineAnswer | None:
         """An answer where the reach tube ends early or leaves no room; None where it serves."""
@@ -359,10 +381,3 @@ def _taken(erosion: Erosion, needed: Array) -> float:
     with np.errstate(all="ignore"):
         shares = np.where(room > 0, needed / room, np.inf)[first:]
     return float(np.max(shares, initial=0.0))
-
-
-def _assumption(constants: Constants) -> str:
-    if constants.certified:
-        return ""
-    name, value = ("rate", constants.rate) if constants.continuous else ("gain", constants.gain)
-    return f"the stated constants ({name} = {value}, sigma = {constants.sigma}) are assumed, not proved"

@@ -17,6 +17,8 @@ from certbound.safety.answers import AS_IT_IS, SPARED, Deviation, EngineAnswer, 
 
 _SAYS = 1e-3  # of delta: a lower bound of less than that says nothing
 
+_FIRST = "a first bound of the linear response; its largest parts were not made smaller after it"
+
 
 def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """Smallest probability that Thm K7' proves for the problem, with one cell unless ``asked`` for more.
@@ -35,8 +37,7 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     foresight = not depends_on_state(problem)
 
     def found(answer: LinearAnswer) -> None:
-        first = "a first bound of the linear response; its largest parts were not made smaller after it"
-        reason = first if answer.log10_delta < 0 else answer.reason
+        reason = _FIRST if answer.log10_delta < 0 and not answer.impossible else answer.reason
         asked.found(EngineAnswer(
             log10_delta=answer.log10_delta, method="linear", details=answer, foresight=foresight, reason=f"{reason}.",
         ))  # fmt: skip
@@ -69,9 +70,9 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
         return EngineAnswer(applicable=False, reason=hidden, method="linear")
 
     def found(answer: LinearAnswer) -> None:
+        reason = answer.reason if answer.impossible else _FIRST
         asked.found(EngineAnswer(
-            log10_delta=answer.log10_delta, method="linear", details=answer, foresight=True,
-            reason="a first bound of the linear response; its largest parts were not made smaller after it.",
+            log10_delta=answer.log10_delta, method="linear", details=answer, foresight=True, reason=f"{reason}.",
         ))  # fmt: skip
 
     answer = linear_answer(loop, cells=asked.cells, thorough=asked.thorough, before=asked.before, found=found)

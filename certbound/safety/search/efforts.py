@@ -139,9 +139,9 @@ def next_action(standings: Sequence[Standing], left: float, *, patient: bool) ->
         chosen = min(able, key=lambda one: (len(one.turns), one.log10_delta))
         share = _PART * left if len(unfinished) > 1 else left
         return Action(engine=chosen.name, effort=_last(chosen).effort * _most(chosen, share), seconds=share)
-    chosen = min(unfinished, key=lambda one: (one.interrupted, one.log10_delta), default=None)  # type: ignore[arg-type]
-    if chosen is None:
+    if not unfinished:
         return None
+    chosen = min(unfinished, key=lambda one: (one.interrupted, one.log10_delta))
     growth = 1.0 if chosen.interrupted else _GROWTH[0]
     return Action(engine=chosen.name, effort=_last(chosen).effort * growth, seconds=left)
 

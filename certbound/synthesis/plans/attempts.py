@@ -34,6 +34,8 @@ SLACK = 1e-6
 """Share by which every erosion is enlarged: a proof needs some room."""
 REPAIRS = 5
 """Plans that are verified before the one with the most room is taken."""
+INPUTS = "inputs within their bounds"
+"""What the bounds of the inputs are called."""
 ENOUGH = 1.02
 """Room (times the tube) from which no more is looked for."""
 
@@ -256,6 +258,8 @@ class Attempts:
         times, faces = planner.grid.times(), planner.faces
         point, face = np.unravel_index(int(np.argmax(widest.pressure)), widest.pressure.shape)
         label, at = faces[int(face)].label, float(times[int(point) + 1])
+        if widest.input_pressure.max(initial=0.0) > widest.pressure.max(initial=0.0):
+            label, at = INPUTS, float(times[int(np.argmax(widest.input_pressure))])
         proved, kind, bound = False, "solver found no point", math.inf
         if name != "linear":  # its erosion depends on the plan: nothing is proved about other plans
             empty = empty_at_once(faces, tightened.erosion, times)
@@ -295,6 +299,7 @@ class Attempts:
         planner = self.planner
         own = planner.program.applied_inputs(solution.inputs, solution.states)
         missing = planner.program.missing(solution.states, planner.grid.times(), tightened.erosion)
+        missed = planner.program.inputs_missing(solution.inputs, solution.states, tightened.inputs)
         return Synthesis(
             feasible=feasible,
             status="UNKNOWN" if verdict is None else verdict.status,
@@ -305,7 +310,7 @@ class Attempts:
             states=solution.states, times=planner.grid.times(), erosion=tightened.erosion,
             labels=tuple(face.label for face in planner.faces), method=name, constants=constants,
             feedback=planner.feedback, cost=solution.cost, max_input=float(np.abs(own).max(initial=0.0)), scale=scale,
-            softened=0.0 if feasible else float(max(missing.max(initial=0.0), 0.0)), infeasibility=None,
+            softened=0.0 if feasible else float(max(missing.max(initial=0.0), missed)), infeasibility=None,
             smallest_delta=None,
             verdict=verdict, seconds=0.0,
         )  # fmt: skip

@@ -127,7 +127,7 @@ class _Induction:
             poll(f"values at step {t}, {self.grid.shape[0]} x {self.grid.shape[1]} cells")
             means, zone = self._means_at(t), self._zone_at(t)
             if above is not None:
-                above = _kept(self._above(means.back(above, self._fixed_above(means, zone), 1.0)))
+                above = _kept(self._above(means.back(above, self._fixed_above(means, zone, t), 1.0)))
             if below is not None:
                 fixed = self._fixed_below(means, zone, t)
                 below = _kept(self._below(means.back(below, fixed, 0.0), t))
@@ -147,7 +147,7 @@ class _Induction:
             return 1.0, 0.0
         zone, upper, lower = _Zone(safe=safe, broken=broken), 1.0, 0.0
         if above is not None:
-            fixed = np.where(meets, self._fixed_above(means, zone), -np.inf)
+            fixed = np.where(meets, self._fixed_above(means, zone, 0), -np.inf)
             found = means.back(above, fixed, 1.0)
             upper = float(np.maximum.reduce(corners(found)).ravel()[meets].max())
         if below is not None:
@@ -183,7 +183,8 @@ class _Induction:
         key: list[object] = [id(one) for one in active]
         key += [t] if any(one.region.moving for one in active) else []
         if self._zone is None or self._zone[0] != key:
-            safe, broken = respected(active, self.work.states(self.grid.cells()), t)
+            closed = [one.closed() for one in active]  # an edge is a line of the grid, whose nodes take the worse side
+            safe, broken = respected(closed, self.work.states(self.grid.cells()), t)
             self._zone = key, _Zone(safe=safe, broken=broken)
         return self._zone[1]
 
@@ -202,19 +203,20 @@ class _Induction:
         ends = self.layout.beyond(t, self.grid)[1]
         return Lines(nodal=nodal, below=-1.0 if ends[0] else 0.0, above=-1.0 if ends[1] else 0.0)
 
-    def _fixed_above(self, means: Means, zone: _Zone) -> Array:
+    def _fixed_above(self, means: Means, zone: _Zone, t: int) -> Array:
         """1 on cells that may be unsafe, from which paths may come beyond the lines, or that are unknown; else NaN."""
         free = np.zeros(len(zone.safe), dtype=bool)
-        free[means.landing.live] = ~(means.leaves(0) | means.leaves(1))
+        leaving = [means.leaves(side, edge=edge) for side, edge in enumerate(self.work.fails_on_ends(t + 1))]
+        free[means.landing.live] = ~(leaving[0] | leaving[1])
         return np.where(free & zone.safe, np.nan, 1.0)
 
     def _fixed_below(self, means: Means, zone: _Zone, t: int) -> Array:
         """-1 on cells that have failed, or all whose paths have in a step; 0 on cells of which nothing is known."""
         live = means.landing.live
-        lost, unknown = zone.broken.copy(), ~live
+        lost, unknown, edges = zone.broken.copy(), ~live, self.work.fails_on_ends(t + 1)
         for side, sure in enumerate(self.layout.beyond(t + 1, self.grid)[0]):
             if sure:
-                lost[live] |= means.leaves(side, wholly=True)
+                lost[live] |= means.leaves(side, wholly=True, edge=edges[side])
             else:
                 unknown[live] |= means.leaves(side)
         return np.where(lost, -1.0, np.where(unknown, 0.0, np.nan))

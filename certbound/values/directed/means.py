@@ -60,12 +60,17 @@ class Means:
             np.copyto(part, np.maximum(part, np.where(np.isnan(asked), mean + more, asked)))
         return found
 
-    def leaves(self, side: int, *, wholly: bool = False) -> Mask:
-        """Of the live cells: whether some of f (or all of it) may lie below the lines (side 0), or above them (1)."""
+    def leaves(self, side: int, *, wholly: bool = False, edge: bool = False) -> Mask:
+        """Of the live cells: whether some of f (or all of it) may lie below the lines (side 0), or above them (1).
+
+        With ``edge`` what lies on the outermost line counts too.
+        """
         y, (low, high) = self.after.axes[0], self.landing.ends
         if side == 0:
-            return np.asarray((high if wholly else low) < y[0])
-        return np.asarray((low if wholly else high) > y[-1])
+            end, last = (high if wholly else low), y[0]
+            return np.asarray(end <= last if edge else end < last)
+        end, last = (low if wholly else high), y[-1]
+        return np.asarray(end >= last if edge else end > last)
 
 
 def means_of(work: Directed, t: int, grid: Grid, after: Grid, ranges: Ranges) -> Means | None:

@@ -42,7 +42,8 @@ class Directed:
     tape : Tape
         (F, g) over ("t", "y", "q", inputs).
     limits : tuple of Inside
-        What paths respect; half-spaces along a state as boxes, whose faces are compared exactly.
+        What paths respect; half-spaces along a state as boxes, whose faces are compared exactly. Of half-spaces to keep
+        out of they are what these leave, without the face (`Inside.without_edge`).
     """
 
     problem: Problem
@@ -91,6 +92,13 @@ class Directed:
         """Ends of p and q that the constraints of a step set, infinite where they set none."""
         low, high = box_around(active_at(self.limits, t), 2, t)
         return low[list(self.order)], high[list(self.order)]
+
+    def fails_on_ends(self, t: int) -> tuple[bool, bool]:
+        """Whether a state on the lower, and on the upper end of p has failed at a step."""
+        active = active_at(self.limits, t)
+        (low, high), p = box_around([one for one in active if one.without_edge], 2, t), self.order[0]
+        first, last = (end[0] for end in self.ends(t))
+        return bool(low[p] >= first > -np.inf), bool(high[p] <= last < np.inf)
 
     def paths(self) -> tuple[Array, Array, Array]:
         """Of simulated paths: least and largest (y, q), and their standard deviations at all times, shape (T, 2)."""

@@ -99,7 +99,9 @@ def band_of(
     held = (height.lo - excess[2]) * (1 - 1e-12)
     live = live & (held > 0.5 * height.hi)
     ends = (float(held[live].min()), float(held[live].max())) if live.any() else (1.0, 1.0)
-    share = np.clip((held - ends[0]) / max(ends[1] - ends[0], 1e-300), 0.0, 1.0)
+    share = np.zeros(held.shape)  # of one variance there is nothing between
+    if ends[1] > ends[0]:
+        share = np.clip((held - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
     sigmas = [math.sqrt(end) for end in ends]
     sigma = base.sigma, sigmas[0]
     more = np.where(live, (height.hi - held) * _UP + 1e-14 * height.hi, 0.0)

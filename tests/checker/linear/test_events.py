@@ -11,7 +11,7 @@ from certbound.checker.balls.eigen import cholesky, largest_eigenvalue
 from certbound.checker.balls.matrices import diagonal, identity, is_positive_definite, matrix
 from certbound.checker.balls.normal import below_and_above, tail
 from certbound.checker.constants.kummer import Kummer, exit_probability
-from certbound.checker.linear.events import Windows, chain, sub_gaussian
+from certbound.checker.linear.events import MOST_ENTRIES, Windows, bounded_drives, chain, sub_gaussian
 from certbound.checker.linear.response import continuous_piece, covariances, discrete_piece
 from certbound.checker.report import Budget, Unproved
 
@@ -153,3 +153,24 @@ def test_a_budget_ends_the_work() -> None:
         budget.check()
     with pytest.raises(Unproved, match="sub-boxes"):
         Budget(10, boxes=0).box()
+
+
+def test_bounded_noise_never_exceeds_what_all_of_it_does_at_most():
+    """Z+ = Z/2 + w with |w| <= 1: |Z| <= 0, 1, 1.5, 1.75 at steps 0 to 3."""
+    half = [arb_mat([[arb(0.5)]])] * 3
+    drives = bounded_drives(half, arb_mat([[arb(1)]]), [arb(1)], Budget(10))
+    proxies = [arb_mat([[arb(v)]]) for v in (0, 1, 1.25, 1.3125)]
+    rows = [[arb(1)]] * 4
+    levels = [arb(0), arb(1) + arb(2) ** -40, arb(1.5) + arb(2) ** -40, arb(1.75) + arb(2) ** -40]
+    assert sub_gaussian(rows, levels, proxies, Budget(10), drives) == 0
+    short = [*levels[:3], arb(1.74)]
+    exact = (-arb(1.74) ** 2 / (2 * arb(1.3125))).exp()
+    assert abs(sub_gaussian(rows, short, proxies, Budget(10), drives) - exact) < 1e-12
+    assert sub_gaussian(rows, levels, proxies, Budget(10)) > exact
+    assert not sub_gaussian(rows, [arb.nan()] * 4, proxies, Budget(10), drives) < 1
+
+
+def test_too_many_steps_of_bounded_noise_are_not_kept():
+    steps = [arb_mat([[arb(0.5)]])] * 1500
+    assert MOST_ENTRIES < 1500 * 1501 // 2
+    assert bounded_drives(steps, arb_mat([[arb(1)]]), [arb(1)], Budget(10)) is None

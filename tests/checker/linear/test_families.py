@@ -74,9 +74,13 @@ def test_unequal_rooms_take_the_better_of_both_bounds() -> None:
 
 @pytest.mark.parametrize("noise", [cb.SubGaussian(proxy_std=0.2), cb.Uniform(halfwidth=0.2 * math.sqrt(3))])
 def test_other_laws_are_only_added(noise: object) -> None:
-    problem = contraction(3, 1, noise=noise)
+    problem = contraction(1, 1, noise=noise, safe=[cb.Inside(cb.Box([-0.34], [0.34]))])
     _, found = proved(problem)
-    assert found == pytest.approx(6 * math.exp(-0.25 / 0.08), rel=1e-9)
+    assert found == pytest.approx(2 * math.exp(-(0.34**2) / 0.08), rel=1e-9)
+
+
+def test_noise_that_is_bounded_is_nowhere_beyond_its_bounds() -> None:
+    assert proved(contraction(3, 1, noise=cb.Uniform(halfwidth=0.2 * math.sqrt(3))))[1] == 0
 
 
 def events(values: list[float], *, normal: bool, opposite: bool = True) -> float:

@@ -13,7 +13,9 @@ from flint import arb, ctx
 import certbound as cb
 from certbound.checker import check_data
 from certbound.checker.linear.samplers import Sampler
+from certbound.checker.statement.tapes import Hold
 from certbound.errors import CertificateError
+from certbound.problem.model import Node, Tape
 from certbound.safety.certificate import certificate_data, problem_data
 
 HOLDS = 3
@@ -105,3 +107,10 @@ def test_a_proof_by_another_engine_is_refused() -> None:
     data["claim"]["method"] = data["proof"]["engine"] = "constants"
     with pytest.raises(CertificateError, match="engine"):
         check_data(data)
+
+
+def test_a_part_of_the_horizon_ends_at_a_sample_just_where_the_floats_say_so() -> None:
+    hold = Hold(count=4, law=Tape(inputs=("t",), nodes=(Node("input", (0,)),), outputs=(0,), shape=(1,)), names=("u",))
+    assert hold.until(1.5, 2.0).count == 3
+    with pytest.raises(CertificateError, match="sampling time"):
+        hold.until(0.225, 0.3)  # three quarters of the float 0.3 are another float

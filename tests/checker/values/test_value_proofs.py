@@ -595,3 +595,13 @@ def test_noise_that_is_too_small_for_floats_is_refused_in_words(std: float) -> N
     data = parse(text("valued"))
     data["problem"]["noise"]["values"] = exact([std])
     assert "the noise is too small" in check_data(data).reason
+
+
+def test_a_start_on_the_edge_of_an_obstacle_is_proved_to_fail() -> None:
+    obstacle = cb.Outside(cb.Box([1.0], [2.0]))
+    system = cb.DiscreteSystem(lambda x: 0 * x, states=1, noise=cb.Rademacher(scale=1.0))
+    problem = cb.Problem(system, initial=[1.0], safe=[obstacle, cb.Inside(cb.Box([-4.0], [4.0]))], horizon=1)
+    verdict = cb.verify_safety(problem, method="values")
+    assert verdict.status == "UNSAFE"
+    report = check_data(verdict.certificate)
+    assert report.valid, report.reason

@@ -2,6 +2,7 @@
 
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -281,8 +282,27 @@ def test_problems_are_found_in_modules(tmp_path, monkeypatch):
     assert sys.path == path
     with pytest.raises(ValueError, match="`source` must name an importable module"):
         load("no_such_module_of_ours:build")
-    with pytest.raises(ValueError, match=r"must be package.module:name"):
-        load(":build")
+    for name in (":build", "a..b:build", "no-name:build"):
+        with pytest.raises(ValueError, match=r"must be package.module:name"):
+            load(name)
+
+
+@pytest.mark.parametrize(("line", "error", "words"), [
+    ("import a_module_that_is_not_there", ModuleNotFoundError, "No module named 'a_module_that_is_not_there'"),
+    ("from math import nothing", ImportError, "cannot import name 'nothing'"),
+    ("import certbound as cb; cb.Box([1], [0])", ValueError, "`low` must not exceed `high`"),
+    ("{}['key']", KeyError, "key"),
+])  # fmt: skip
+def test_what_a_module_raises_while_it_is_loaded_is_passed_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, error: type[Exception], words: str
+) -> None:
+    """Its name is right, and was called wrong."""
+    (tmp_path / "raising_when_loaded.py").write_text(f"{line}\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(error, match=words) as caught:
+        load("raising_when_loaded:build")
+    assert "must name" not in str(caught.value)
+    assert "package.module" not in str(caught.value)
 
 
 def test_states_may_have_greek_names(tmp_path):

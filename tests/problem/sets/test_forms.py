@@ -84,3 +84,11 @@ def test_what_cannot_be_moved_outward_says_so():
     with pytest.raises(ValueError, match="a set of the kind ellipsoid cannot be moved outward evenly"):
         Ellipsoid([0, 0], SHAPE).grown(0.1)
     np.testing.assert_allclose(Polytope([[3.0, 4.0]], [1.0]).grown(0.1).b, [1.5])
+
+
+def test_points_on_the_edge_of_an_ellipsoid_with_whole_half_axes_are_in_it():
+    for shape, points in (([25.0, 25.0], [[3, 4], [-4, 3], [5, 0]]), ([9.0, 16.0], [[3, 0], [0, -4]])):
+        found = Ellipsoid([1.0, -2.0], np.diag(shape))
+        edge = np.array(points) + np.array([1.0, -2.0])
+        assert found.contains(edge).all()
+        assert not found.contains(edge + 2.0**-40 * np.array(points)).any()

@@ -133,3 +133,19 @@ polygon = { vertices = { py = [-0.5, 0.5, 0], px = [-0.5, -0.5, 0.5] } }
 def test_bad_tables_are_refused(table, message):
     with pytest.raises(ValueError, match=message):
         loads(PLANE + table)
+
+
+def test_a_polygon_whose_sides_floats_hold_is_exact():
+    corners = [[3, 4], [-3, 4], [-3, -4], [3, -4]]
+    for outward in (True, False):
+        found = polygon(corners, outward=outward)
+        assert found.contains(corners).all()
+        assert not found.contains(np.array(corners) * (1 + 2.0**-52)).any()
+
+
+def test_an_intersection_whose_faces_floats_hold_is_exact():
+    shifted = cb.Box([-1, -1], [1, 1], center=lambda t: [2 + 0 * t, 0 * t])
+    for outward in (True, False):
+        found = intersection([shifted, cb.HalfSpace([1.0, 1.0], 4.0)], dimension=2, outward=outward)
+        assert found.contains([[3, 1], [1, -1]]).all()
+        assert not found.contains([[3 + 2.0**-51, 0], [1 - 2.0**-53, 0]]).any()

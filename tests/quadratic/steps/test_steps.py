@@ -110,7 +110,7 @@ def test_the_expectation_of_what_is_proved_does_not_grow() -> None:
 ])  # fmt: skip
 def test_bounds_lie_above_simulation_whatever_the_law(noise: Any) -> None:
     problem = waves(noise)
-    bound = bound_steps(problem, target=0.5, seconds=2)
+    bound = bound_steps(problem, target=0.5, seconds=60)
     exits = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(2))
     assert bound.upper < -0.3
     assert 10**bound.upper >= exits.lower
@@ -145,7 +145,7 @@ def test_obstacles_and_balls_may_be_jumped_into() -> None:
     system = cb.DiscreteSystem(lambda x: [0.5 * x[0], 0.5 * x[1]], states=2, noise=cb.Gaussian(std=0.25))
     safe = [cb.Inside(cb.Ball([0, 0], 1.5)), cb.Outside(cb.Box([0.9, -0.3], [1.1, 0.3]))]
     problem = cb.Problem(system, initial=[0, 0], safe=safe, horizon=15, delta=1e-3)
-    bound = bound_steps(problem, target=0.2, seconds=3)
+    bound = bound_steps(problem, target=0.2, seconds=60)
     exits = cb.simulate_exits(problem, paths=50_000, rng=np.random.default_rng(5))
     assert exits.lower < 10**bound.upper <= 0.2
 

@@ -342,3 +342,23 @@ def test_what_is_refused(change, words):
         change = {}
     with pytest.raises(InfeasibleError, match=words):
         bound_directed_failure(problem.replace(**change), seconds=0.3)
+
+
+def test_a_state_on_the_face_of_an_obstacle_has_failed() -> None:
+    """p+ = where(q < 1, 0, 1), or 1: in the obstacle p >= 1, and in the set p <= 1 to stay in."""
+    wide = cb.Inside(cb.Box([-np.inf, -40.0], [np.inf, 40.0]))
+    truth = float(ndtr(-0.5))
+    for region in (cb.HalfSpace([-1.0, 0.0], -1.0), cb.Box([1.0], [np.inf], coordinates=[0])):
+        for jumps, probability in ((True, truth), (False, 1.0)):
+            system = cb.DiscreteSystem(
+                lambda x, jumps=jumps: [np.where(x[1] < 1, 0.0, 1.0) if jumps else 1 + 0 * x[0], 0.9 * x[1]],
+                states=2, noise=cb.Gaussian(std=[2.0]), noise_matrix=np.array([[0.0], [1.0]]),
+            )  # fmt: skip
+            problem = cb.Problem(system, initial=[0.0, 0.0], safe=[cb.Outside(region), wide], horizon=2)
+            found = bound_directed_failure(problem, seconds=1.0, delta=0.05)
+            assert 0.5 * probability < found.lower <= probability * (1 + 1e-9)
+            assert probability * (1 - 1e-9) <= found.upper <= 1.5 * probability
+            within = problem.replace(safe=[cb.Inside(cb.HalfSpace([1.0, 0.0], 1.0)), wide])
+            found = bound_directed_failure(within, seconds=1.0, delta=0.05)
+            assert found.lower == 0
+            assert found.upper < 0.25

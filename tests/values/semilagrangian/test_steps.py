@@ -25,6 +25,7 @@ from certbound.values.semilagrangian.flows import EQUATIONS, augmented, flow, sh
 from certbound.values.semilagrangian.groundwork import layouts_of, nodes_of
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import serves, setting_of
+from certbound.values.semilagrangian.obstacles.passings import first_root
 from certbound.values.semilagrangian.remainders import bowed, level_of, remainders, upper_tail
 from certbound.values.semilagrangian.smoothers import WIDER, across, along
 from certbound.values.semilagrangian.smoothing import Lines, smoothed
@@ -64,6 +65,19 @@ def test_a_step_too_long_to_be_enclosed_is_not_known() -> None:
     setting = setting_of(mechanical(lambda x: x[0] ** 3 * 50, 0.4, [-3, -3], [3, 3]))
     found = flow(setting.tape, [Interval.point(np.array([0.0, 3.0])), Interval.point(np.array([0.0, 3.0]))], 1.0, 4)
     assert found.known.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e7, 1e10])
+def test_bands_are_the_same_in_units_in_which_states_are_millions(unit: float) -> None:
+    """All cells of a linear model have one variance, and nothing lies between it and itself."""
+    problem = mechanical(lambda x: -x[0] - 0.3 * x[1], 0.3 * unit, [-unit, -3 * unit], [unit, 3 * unit], 0.5)
+    layout = next(layouts_of(setting_of(problem), Plan(count=4, fine=2.0, wide=0.05, cell=0.5, spare=1e-9)))
+    assert [int(band.live.sum()) for band in layout.bands] == [11700]
+    assert not layout.bands[0].share[layout.bands[0].live].any()
+
+
+def test_what_is_far_away_and_does_not_move_never_arrives() -> None:
+    assert first_root(np.array([1e9, 2.0]), np.array([0.0, 1.0]), 0.0)[0] == np.inf
 
 
 def test_linear_models_leave_no_remainder() -> None:

@@ -264,7 +264,9 @@ def first_root(away: Array, speed: Array, turn: float) -> Array:
     """The first t > 0 with away = speed t - turn t^2/2, rounded down; inf without one. For away > 0, speed >= 0."""
     rest = speed**2 * (1 + 1e-12) - 2 * turn * away
     speed = np.maximum(speed, 0.0) * _UP
-    return np.where(rest < 0, np.inf, 2 * away / np.maximum(speed + np.sqrt(np.maximum(rest, 0.0)) * _UP, 1e-300))
+    with np.errstate(over="ignore"):  # what is large and does not move is never there
+        first = 2 * away / np.maximum(speed + np.sqrt(np.maximum(rest, 0.0)) * _UP, 1e-300)
+    return np.where(rest < 0, np.inf, first)
 
 
 def at_most(z: Array) -> Array:

@@ -96,7 +96,8 @@ def dipped(motion: Motion, arrival: Arrival, above: Array, *, upper: bool) -> Ar
     if upper:  # who is there by the end only: all of those, whatever Z does
         late = np.flatnonzero(arrival.t >= h)
         loose = np.sqrt(arrival.lean[late] ** 2 + arrival.loose[late] ** 2)
-        gaps = (arrival.gap[late] / np.maximum(loose, 1e-300) / math.sqrt(2)).tolist()
+        with np.errstate(over="ignore"):  # so many deviations that no path is there
+            gaps = (arrival.gap[late] / np.maximum(loose, 1e-300) / math.sqrt(2)).tolist()
         found[:, late] = np.array([0.5 * math.erfc(gap) for gap in gaps]) * (1 + 1e-8) + 1e-300
         found[:, (arrival.t > t) & (arrival.t < h)] = 1.0  # too near to the end for these formulas
         return np.asarray(found)

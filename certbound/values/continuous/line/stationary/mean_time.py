@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from certbound.values.continuous.coefficients import enclose, squared_diffusion
 from certbound.values.exact import interval_of
 from certbound.watch import poll
 
-_FIRST, _MOST = 256, 50_000  # cells at first, and at most
+_FIRST, _MOST = 256, 100_000  # cells at first, and at most
 _GOOD = 3e-4  # of L m, by which it may miss -1 in a cell that is not halved
 _HALVINGS, _IDLE = 24, 3  # rounds at most, and those without a gain, as rounding is in the way
 _WORST = 0.5  # of L m, by which it may miss -1 at all
@@ -342,11 +343,12 @@ def _collocated(model: _Model, nodes: Array, free: tuple[bool, bool], slope: flo
         entries.append(weights)
         right[-1] = 0.0
     rows.append(np.full(len(columns[-1]), 2 * count))
-    parts = [np.concatenate(part) for part in (entries, rows, columns)]
-    if not np.isfinite(parts[0]).all():
+    values = np.concatenate(entries)
+    if not np.isfinite(values).all():
         return None
     try:
-        found = splu(csc_matrix((parts[0], (parts[1], parts[2])))).solve(right)
+        places: Any = np.concatenate(rows), np.concatenate(columns)
+        found = splu(csc_matrix((values, places))).solve(right)
     except RuntimeError:  # singular
         return None
     return (found[0::2], found[1::2]) if np.isfinite(found).all() else None
