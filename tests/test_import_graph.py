@@ -52,6 +52,7 @@ tubes.exact
 tubes
 values
 values.continuous values.discrete
+values.backward
 values.semilagrangian values.chains values.directed
 simulation.compiled
 simulation

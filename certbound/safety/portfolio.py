@@ -168,6 +168,17 @@ ENGINES: dict[str, Engine] = {
             spares=3,
         ),
         Engine(
+            name="backward",
+            words="the backward equation solved in floats, its error bounded cell by cell and carried by the process "
+            "(Thm K10, two and three states in continuous time)",
+            when="while nothing else has proved SAFE; limits along the coordinates, noise along some states or all; "
+            "bounds from both sides",
+            prove=in_coordinates(backward_engine),
+            reserve=True,
+            refines=True,
+            dear=True,
+        ),
+        Engine(
             name="values",
             words="the probability itself as a function on a grid, from both sides (Thm K8, up to three states)",
             when="while nothing else has proved SAFE; bounds from both sides, and certificates of UNSAFE",
@@ -179,17 +190,6 @@ ENGINES: dict[str, Engine] = {
             dear=True,
             reaches=True,
             endless=True,
-        ),
-        Engine(
-            name="backward",
-            words="the backward equation solved in floats, its error bounded cell by cell and carried by the process "
-            "(Thm K10, two and three states in continuous time)",
-            when="while nothing else has proved SAFE; limits along the coordinates, noise along some states or all; "
-            "bounds from both sides",
-            prove=in_coordinates(backward_engine),
-            reserve=True,
-            refines=True,
-            dear=True,
         ),
     )
 }

@@ -164,8 +164,8 @@ def test_settings_that_are_not_served_are_refused_by_name() -> None:
     stay = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
     cases = {
         "discrete": cb.DiscreteSystem(lambda x, y: [x / 2, y / 2], states=["x", "y"], noise=cb.Gaussian(std=0.1)),
-        "changes with time": cb.ContinuousSystem(lambda t, x, y: [np.sin(t) - x, -y], **plain),
-        "disturbance": cb.ContinuousSystem(
+        "change with time": cb.ContinuousSystem(lambda t, x, y: [np.sin(t) - x, -y], **plain),
+        "a disturbance": cb.ContinuousSystem(
             lambda x, d: [d[0] - x[0], -x[1]], disturbance=cb.Box([-0.1], [0.1]), **plain
         ),
     }
