@@ -19,6 +19,7 @@ from typing import Any
 from certbound.errors import EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
+from certbound.problem.sets import is_spread
 from certbound.safety.answers import EngineAnswer, Request, is_more_than, may_decide, with_lower
 from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
@@ -59,7 +60,7 @@ def decide(
         raise TypeError(f"`method` must be the name of one, got {method!r}; leave it out for the best of all engines.")
     plain = "auto" if method in ENGINES else method
     request = Request(method=plain, cells=cells, constants=constants, thorough=method != "auto")
-    names = engines_of(method)
+    names = _asked_of(problem, engines_of(method))
     watch = watch or current_watch() or Watch()
     for start in problem.starts:
         check_request(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
@@ -82,6 +83,12 @@ def decide(
     except OutOfTime:
         _log.info("the search ended with its time")
     return search.verdict(names)
+
+
+def _asked_of(problem: Problem, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The engines without those that serve random starts alone, where the start is not random."""
+    random = any(start.random for start in problem.starts)
+    return names if random or len(names) == 1 else tuple(name for name in names if not ENGINES[name].drawn)
 
 
 class _Search:
@@ -122,7 +129,12 @@ class _Search:
         return self.settled and (self.safe or self.refuted or ENGINES[name].write_below is None)
 
     def violation(self) -> Violation | None:
-        """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
+        """A proved violation of the noise-free model; None where there is none, or where the search for one failed.
+
+        The path of the mean says nothing of a random start: no path need be near it.
+        """
+        if is_spread(self.problem.initial):
+            return None
         if self.lasting or self.problem.ending or (self.problem.reach is not None and self.problem.reach.stays):
             return None
         self.watch.engine = "noise-free"

@@ -11,6 +11,7 @@ from certbound.safety.engines.oblique_limits import Apart, Logarithmic, Turned, 
 from certbound.safety.engines.quadratic import quadratic_engine
 from certbound.safety.engines.random_starts import prove_truncated
 from certbound.safety.engines.rooms import joined, log10_sum
+from certbound.safety.engines.start_cells import starts_engine
 from certbound.safety.engines.values import values_engine
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "Logarithmic",
     "prove_truncated",
     "quadratic_engine",
+    "starts_engine",
     "Turned",
     "values_engine",
 ]
