@@ -79,7 +79,7 @@ class _Attempt:
 
     def proved(self) -> LeastFailing | None:
         run, problem = self.run, self.run.engine.problem
-        bounds = run.include(self.levels, 1) if run.curved else run.nothing
+        bounds = run.include(self.levels, 1)  # of a linear model too: its nominal is only followed in steps
         if bounds is None:
             return None
         probability, label, time = _least(run, self.found, bounds)
