@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from certbound.reach.starts.averages import StartBounds
-from certbound.reach.starts.silent import bound_silent_start
+from certbound.reach.starts.noisy import bound_noisy_start
+from certbound.reach.starts.silent import bound_silent_start, is_silent
 
-__all__ = ["bound_silent_start", "StartBounds"]
+__all__ = ["bound_noisy_start", "bound_silent_start", "is_silent", "StartBounds"]

@@ -69,7 +69,7 @@ class StartCells:
         chosen = np.sort(chosen)
         rows, axis = np.arange(len(chosen)), self.axis[chosen]
         low, high = np.repeat(self.low[chosen], 2, axis=0), np.repeat(self.high[chosen], 2, axis=0)
-        cut = _cut(self.low[chosen, axis], self.high[chosen, axis])
+        cut = halved(self.low[chosen, axis], self.high[chosen, axis])
         high[2 * rows, axis] = cut
         low[2 * rows + 1, axis] = cut
         least, most = self.start.mass(low, high)
@@ -121,7 +121,7 @@ class StartCells:
         return broken, by
 
 
-def _cut(low: Array, high: Array) -> Array:
+def halved(low: Array, high: Array) -> Array:
     """Where an interval is halved: in its middle, or one deviation from the end that is nearer to 0."""
     middle = (low + high) / 2
     return np.where(low >= 0, np.minimum(middle, low + 1.0), np.where(high <= 0, np.maximum(middle, high - 1.0), middle))

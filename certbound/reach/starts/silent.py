@@ -11,7 +11,7 @@ from certbound.errors import EngineError
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Faces
+from certbound.problem.sets import Faces, is_spread
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.reach.linear import Linearisation
 from certbound.reach.remainder import hidden_jump
@@ -26,18 +26,15 @@ _NODES = 400  # at which what matters is looked for
 _MISSED = 1e-4  # of the probability: what the directions that are not cut may lie beyond their reach
 
 
-def refusal(problem: Problem) -> str | None:
-    """Why the paths of a random start are no linear functions of it alone; None where they are."""
-    system = problem.system
-    if not problem.initial.random or not np.any(problem.initial.covariance):
+def unserved(problem: Problem) -> str | None:
+    """Why a random start is not averaged over in cells; None where it is."""
+    box = problem.system.disturbance
+    if not is_spread(problem.initial):
         return "the start is not random."
     if problem.endless or problem.reach is not None or problem.hold is not None:
         return "cells of a random start need a finite horizon, constraints only, and inputs that are not held."
-    box = system.disturbance
     if box is not None and np.any(box.low < box.high):
         return "cells of a random start serve no disturbances; give each a value."
-    if not is_silent(problem):
-        return "cells of a random start serve models without noise after the start."
     return None
 
 
@@ -72,7 +69,7 @@ def bound_silent_start(
     EngineError
         If the model is not linear, or something else does not fit; the message says what.
     """
-    why = refusal(problem)
+    why = unserved(problem) or (None if is_silent(problem) else "cells of starts alone serve no noise after the start.")
     problem = problem if why else in_pieces(problem)
     why = why or hidden_jump(problem)
     if why:
