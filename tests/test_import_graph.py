@@ -64,6 +64,7 @@ reach.nominal
 reach.sets reach.remainder
 reach.contraction reach.linear reach.sampled
 reach.below
+reach.starts
 reach
 quadratic.form_matrices quadratic.conic
 quadratic.setting

@@ -19,7 +19,6 @@ from typing import Any
 from certbound.errors import EngineError, contained
 from certbound.problem.goals import met_at
 from certbound.problem.problem import Problem
-from certbound.problem.sets import is_spread
 from certbound.safety.answers import EngineAnswer, Request, is_more_than, may_decide, with_lower
 from certbound.safety.averages import average_verdict
 from certbound.safety.engines import prove_truncated
@@ -129,12 +128,7 @@ class _Search:
         return self.settled and (self.safe or self.refuted or ENGINES[name].write_below is None)
 
     def violation(self) -> Violation | None:
-        """A proved violation of the noise-free model; None where there is none, or where the search for one failed.
-
-        The path of the mean says nothing of a random start: no path need be near it.
-        """
-        if is_spread(self.problem.initial):
-            return None
+        """A proved violation of the noise-free model; None where there is none, or where the search for one failed."""
         if self.lasting or self.problem.ending or (self.problem.reach is not None and self.problem.reach.stays):
             return None
         self.watch.engine = "noise-free"

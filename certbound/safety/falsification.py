@@ -14,7 +14,7 @@ from certbound.arrays import Array
 from certbound.errors import CertboundError
 from certbound.problem.model import compile_numpy, compile_scalar, edged, varying_outputs
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Outside, clearance
+from certbound.problem.sets import Inside, Outside, clearance, is_spread
 from certbound.reach.nominal import Flow
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
@@ -40,11 +40,14 @@ class Violation:
 def find_violation(problem: Problem) -> Violation | None:
     """A noise-free trajectory from the initial set that provably breaks a constraint; None if none was found.
 
-    Leaving the model's domain is not counted: there the model says nothing.
+    Leaving the model's domain is not counted: there the model says nothing. Nor is the path of a random start's mean:
+    no path need be near it.
 
     Proves: the trajectory from ``start`` under one constant disturbance lies in ``reach``, and every point of
     ``reach`` at ``time`` breaks ``constraint``.
     """
+    if is_spread(problem.initial):
+        return None
     flow = Flow(problem)
     rng = np.random.default_rng(0)
     starts, signals = candidates(problem, flow, rng)

@@ -10,7 +10,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import CertboundError, EngineError
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Outside
+from certbound.problem.sets import Inside, Outside, is_spread
 from certbound.reach.nominal import Flow
 from certbound.reach.sets import constraint_clearance
 from certbound.rigor.norms import Norm

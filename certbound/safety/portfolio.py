@@ -125,10 +125,11 @@ ENGINES: dict[str, Engine] = {
     for row in (
         Engine(
             name="starts",
-            words="the normal mass of the starts whose paths fail, cell by cell and from both sides",
-            when="where the start is random: says most of linear models, where the start decides which paths fail; has "
-            "lower bounds too",
+            words="an average over cells of a random start: of whether all paths of a cell fail, where no noise follows "
+            "a linear model's start; else of what the linear response proves of the cell",
+            when="where the start is random; says most where the start decides which paths fail; has lower bounds too",
             prove=starts_engine,
+            refines=True,
             drawn=True,
         ),
         Engine(

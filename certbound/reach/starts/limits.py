@@ -72,7 +72,8 @@ class Limit:
         )  # fmt: skip
         self.radius = _radii(form, str(constraint.label)) if isinstance(form, Quadratic) else (0.0, 0.0)
         self.points = _points(whole, paths.span, first, last, horizon)
-        self.pieces = whole.chosen(asked)
+        self.pieces, self.asked = whole.chosen(asked), asked
+        self.nodes, self.at_nodes = _nodes(paths, first, last, horizon)
 
     def near(self, middle: Array, half: Array) -> _Points:
         """The pieces on which some of the cells may not keep the constraint."""
@@ -85,6 +86,13 @@ class Limit:
         if not len(self.points.value):
             return self.points
         return self.points.chosen(self.room(self.points, *_hull(middle, half))[0] < 0)
+
+    def rooms(self, middle: Array, half: Array) -> Array:
+        """Lower bounds of the room that every face of a set to stay in leaves on every piece, (B, M, faces)."""
+        assert isinstance(self.form, Faces)
+        spread = np.einsum("mckd,bd->bmck", np.abs(self.pieces.gains), half) + self._rest(self.pieces)
+        high = (self.pieces.at(middle) + spread).max(axis=2) + self.pieces.slack
+        return np.asarray(self.form.bounds - high)
 
     # ---- keeping -------------------------------------------------------------------------------------------------
 
@@ -211,6 +219,18 @@ def _centre(constraint: Inside, span: Interval) -> Interval:
     if isinstance(region.center, Tape):
         return enclose(region.center, [span]).broadcast_to((count, region.dimension))
     return Interval.point(np.broadcast_to(region.center_at(), (count, region.dimension)))
+
+
+def _nodes(paths: StartPaths, first: float, last: float, horizon: float) -> tuple[Integers, Integers]:
+    """The numbers of the nodes at which a constraint holds, and their places among its points."""
+    if paths.controls.shape[1] == 1:
+        nodes = np.flatnonzero((paths.span.lo >= first) & (paths.span.hi <= last))
+        return nodes, np.arange(len(nodes))
+    slip = _BRIEF * horizon
+    inside = (paths.span.lo - slip >= first) & (paths.span.lo + slip <= last)
+    inside[0] |= first <= 0 <= last
+    nodes = np.flatnonzero(inside)
+    return nodes, np.arange(len(nodes))
 
 
 def _points(whole: _Points, span: Interval, first: float, last: float, horizon: float) -> _Points:

@@ -18,12 +18,14 @@ from certbound.errors import CertboundError, EngineError
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
+from certbound.problem.systems import DiscreteSystem
 from certbound.reach.below import least_failing_of
-from certbound.reach.linear import Linearisation, linear_answer
+from certbound.reach.linear import Linearisation, depends_on_state, linear_answer
 from certbound.reach.nominal import Cells
 from certbound.reach.remainder import hidden_jump
 from certbound.reach.starts.averages import StartBounds, halved
 from certbound.reach.starts.directions import FAR, StartDirections
+from certbound.reach.starts.shared import SharedResponse, in_half_spaces
 from certbound.reach.starts.silent import effects, unserved
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
@@ -47,6 +49,7 @@ class _Part:
     least: float
     most: float
     axis: int
+    judged: bool = False
 
     @property
     def gap(self) -> float:
@@ -70,6 +73,11 @@ class NoisyStart:
             mean=np.asarray(problem.initial.mean), gains=self.gains, rest=np.zeros((len(self.gains), 0)), reach=0.0,
             slack=np.zeros(len(self.gains)), missed=0.0, distortion=0.0,
         )  # fmt: skip
+        self.from_below = gaussian_noise(problem) and not problem.ending
+        plain = in_half_spaces(problem) and gaussian_noise(problem)
+        self.shared = SharedResponse(
+            problem.replace(initial=GaussianStart(self.start.mean, self.rest)), self.start, self.error
+        ) if plain else None  # fmt: skip
         edges = np.array([-FAR, -_FIRST, 0.0, _FIRST, FAR])
         corners = np.stack(np.meshgrid(*[np.arange(4)] * count, indexing="ij"), axis=-1).reshape(-1, count)
         self.parts = [self._untried(edges[corner], edges[corner + 1]) for corner in corners]
@@ -84,7 +92,6 @@ class NoisyStart:
         self, most: int, enough: Callable[[StartBounds], bool], found: Callable[[StartBounds], object]
     ) -> StartBounds:
         """Look at the cells that may gain most, and halve them, until the bounds are enough, or there are ``most``."""
-        tried: set[int] = set()
         while True:
             now = self.bounds()
             if enough(now) or len(self.parts) >= most:
@@ -93,16 +100,13 @@ class NoisyStart:
             part = self.parts[place]
             if part.gap <= 0:
                 return now
-            if id(part) not in tried:
+            if not part.judged:
                 self.parts[place] = self._judged(part)
-                tried.add(id(self.parts[place]))
             else:
                 cut = halved(part.low[part.axis], part.high[part.axis])
                 sides = [self._untried(part.low, np.where(np.arange(len(part.high)) == part.axis, cut, part.high), part),
                          self._untried(np.where(np.arange(len(part.low)) == part.axis, cut, part.low), part.high, part)]
-                self.parts[place : place + 1] = judged = [self._judged(side) for side in sides]
-                tried |= {id(side) for side in judged}
-                self._alive = [*getattr(self, "_alive", []), *judged]  # so that no other object has its id
+                self.parts[place : place + 1] = [self._judged(side) for side in sides]
             found(self.bounds())
 
     def _untried(self, low: Array, high: Array, before: _Part | None = None) -> _Part:
@@ -115,6 +119,11 @@ class NoisyStart:
         poll(f"a cell of the random start ({len(self.parts)})")
         middle = (part.low + part.high) / 2
         half = np.maximum(part.high - middle, middle - part.low) * (1 + 1e-15)
+        axis = int(np.argmax(half * self.weights))
+        if self.shared is not None and self.shared.serves:
+            most = min(part.most, self.shared.above(middle, half))
+            least = part.least if self.problem.ending else max(part.least, self.shared.below(middle, half))
+            return replace(part, least=min(least, most), most=most, axis=axis, judged=True)
         centre = self.start.mean + self.gains @ middle
         slack = 1e-13 * (np.abs(self.start.mean) + np.abs(self.gains) @ (np.abs(middle) + half)) + 1e-290
         generators = np.concatenate([(self.gains * half).T, np.diag(slack)])
@@ -129,12 +138,12 @@ class NoisyStart:
             most = min(most, 10.0**level * _UP)
         except (CertboundError, ArithmeticError):
             pass
-        if most > _TARGET / 10 and not self.problem.ending:
+        if most > _TARGET / 10 and self.from_below:
             try:
                 least = max(least, least_failing_of(problem, cell) * _DOWN)
             except (CertboundError, ArithmeticError):
                 pass
-        return replace(part, least=min(least, most), most=most, axis=int(np.argmax(half * self.weights)))
+        return replace(part, least=min(least, most), most=most, axis=axis, judged=True)
 
     @property
     def weights(self) -> Array:
@@ -146,6 +155,12 @@ class NoisyStart:
         if not hasattr(self, "_effects"):
             self._effects = effects(self.problem, Linearisation.of(self.problem))
         return self._effects
+
+
+def gaussian_noise(problem: Problem) -> bool:
+    """Whether noise is normal, and does not know the state."""
+    system = problem.system
+    return not depends_on_state(problem) and (not isinstance(system, DiscreteSystem) or system.noise.gaussian)
 
 
 def _divided(problem: Problem) -> tuple[Array, Array, Array]:
