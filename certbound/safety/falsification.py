@@ -14,7 +14,7 @@ from certbound.arrays import Array
 from certbound.errors import CertboundError
 from certbound.problem.model import compile_numpy, compile_scalar, edged, varying_outputs
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Inside, Outside, clearance, is_spread
+from certbound.problem.sets import Inside, Outside, clearance
 from certbound.reach.nominal import Flow
 from certbound.reach.sets import ReachTube, constraint_clearance
 from certbound.rigor.norms import Norm
@@ -46,7 +46,7 @@ def find_violation(problem: Problem) -> Violation | None:
     Proves: the trajectory from ``start`` under one constant disturbance lies in ``reach``, and every point of
     ``reach`` at ``time`` breaks ``constraint``.
     """
-    if is_spread(problem.initial):
+    if problem.initial.spread:
         return None
     flow = Flow(problem)
     rng = np.random.default_rng(0)

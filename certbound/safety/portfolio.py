@@ -125,8 +125,8 @@ ENGINES: dict[str, Engine] = {
     for row in (
         Engine(
             name="starts",
-            words="an average over cells of a random start: of whether all paths of a cell fail, where no noise follows "
-            "a linear model's start; else of what the linear response proves of the cell",
+            words="an average over cells of a random start: of whether all paths of a cell fail, where no noise follows"
+            " the start of a linear model; else of what the linear response proves of the cell",
             when="where the start is random; says most where the start decides which paths fail; has lower bounds too",
             prove=starts_engine,
             refines=True,

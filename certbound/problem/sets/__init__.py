@@ -5,7 +5,7 @@ from __future__ import annotations
 from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, Reach
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
-from certbound.problem.sets.initial import check_start, check_target, is_spread
+from certbound.problem.sets.initial import check_start, check_target
 from certbound.problem.sets.polytopes import intersection, polygon
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.sets.unions import StartUnion
@@ -21,7 +21,6 @@ __all__ = [
     "GaussianStart",
     "HalfSpace",
     "Inside",
-    "is_spread",
     "intersection",
     "Outside",
     "polygon",

@@ -17,11 +17,6 @@ _ROUNDING, _SLACK = 1e-12, 1e-9
 """Shares of a state's size by which the start's centre, and its farthest part, may miss a constraint."""
 
 
-def is_spread(initial: Region | GaussianStart) -> bool:
-    """Whether a start is random, and not a single point all the same."""
-    return initial.random and bool(np.any(initial.covariance))
-
-
 def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside], *, apart: bool = False) -> None:
     """Refuse a start that violates a constraint that is due at time 0, with a ValueError that names it.
 
@@ -41,7 +36,7 @@ def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside], 
                 f"`safe` must have centres that are defined when their sets count, but that of '{constraint.label}' is "
                 f"{place.tolist()} at time 0; mend the centre, or give the set a later `during`."
             )
-        fault = "" if is_spread(initial) else _fault(initial, center, constraint)
+        fault = "" if initial.spread else _fault(initial, center, constraint)
         if fault:
             raise ValueError(
                 f"`initial` must satisfy every constraint that is due at time 0, but {fault} violates "

@@ -24,7 +24,7 @@ class Cells:
 
     ``round`` is the initial set itself, when it is one cell and a ball or an ellipsoid: its centre and its form.
     ``generators`` (B, G, n) are cells that are zonotopes about their centres, each within its box; the deviation of a
-    random start may then begin with a covariance that differs from its floats by ``start_error`` (n, n), entry by entry.
+    random start may then begin with a covariance that is off its floats by ``start_error`` (n, n), entry by entry.
     """
 
     centres: Array

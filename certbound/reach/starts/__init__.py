@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certbound.reach.starts.averages import StartBounds
+from certbound.reach.starts.cell_masses import StartBounds
 from certbound.reach.starts.noisy import bound_noisy_start
 from certbound.reach.starts.silent import bound_silent_start, is_silent
 

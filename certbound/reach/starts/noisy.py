@@ -7,6 +7,7 @@ failing, with e as part of its deviation: from above and from below. So do the c
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,9 +24,9 @@ from certbound.reach.below import least_failing_of
 from certbound.reach.linear import Linearisation, depends_on_state, linear_answer
 from certbound.reach.nominal import Cells
 from certbound.reach.remainder import hidden_jump
-from certbound.reach.starts.averages import StartBounds, halved
-from certbound.reach.starts.directions import FAR, StartDirections
-from certbound.reach.starts.shared import SharedResponse, in_half_spaces
+from certbound.reach.starts.cell_masses import StartBounds, halved
+from certbound.reach.starts.drawn_directions import FAR, StartDirections
+from certbound.reach.starts.shared_response import SharedResponse, in_half_spaces
 from certbound.reach.starts.silent import effects, unserved
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
@@ -67,14 +68,16 @@ class NoisyStart:
         if why:
             raise EngineError(why)
         self.problem = problem
-        self.gains, self.rest, self.error = _divided(problem)
+        seen = effects(problem, Linearisation.of(problem))
+        self.gains, self.rest, self.error = _divided(problem, seen)
+        self.weights = np.linalg.norm(seen @ self.gains, axis=0)  # of a deviation along each direction
         count = self.gains.shape[1]
         self.start = StartDirections(
             mean=np.asarray(problem.initial.mean), gains=self.gains, rest=np.zeros((len(self.gains), 0)), reach=0.0,
             slack=np.zeros(len(self.gains)), missed=0.0, distortion=0.0,
         )  # fmt: skip
         self.from_below = gaussian_noise(problem) and not problem.ending
-        plain = in_half_spaces(problem) and gaussian_noise(problem)
+        plain = bool(problem.safe) and in_half_spaces(problem) and gaussian_noise(problem)
         self.shared = SharedResponse(
             problem.replace(initial=GaussianStart(self.start.mean, self.rest)), self.start, self.error
         ) if plain else None  # fmt: skip
@@ -103,9 +106,10 @@ class NoisyStart:
             if not part.judged:
                 self.parts[place] = self._judged(part)
             else:
-                cut = halved(part.low[part.axis], part.high[part.axis])
-                sides = [self._untried(part.low, np.where(np.arange(len(part.high)) == part.axis, cut, part.high), part),
-                         self._untried(np.where(np.arange(len(part.low)) == part.axis, cut, part.low), part.high, part)]
+                here = np.arange(len(part.low)) == part.axis
+                cut = halved(part.low, part.high)
+                sides = [self._untried(part.low, np.where(here, cut, part.high), part),
+                         self._untried(np.where(here, cut, part.low), part.high, part)]  # fmt: skip
                 self.parts[place : place + 1] = [self._judged(side) for side in sides]
             found(self.bounds())
 
@@ -116,14 +120,20 @@ class NoisyStart:
                      axis=int(np.argmax(high - low)))  # fmt: skip
 
     def _judged(self, part: _Part) -> _Part:
+        """The cell with what is proved of it."""
         poll(f"a cell of the random start ({len(self.parts)})")
         middle = (part.low + part.high) / 2
         half = np.maximum(part.high - middle, middle - part.low) * (1 + 1e-15)
-        axis = int(np.argmax(half * self.weights))
         if self.shared is not None and self.shared.serves:
-            most = min(part.most, self.shared.above(middle, half))
-            least = part.least if self.problem.ending else max(part.least, self.shared.below(middle, half))
-            return replace(part, least=min(least, most), most=most, axis=axis, judged=True)
+            above, below = self.shared.above(middle, half), self.shared.below(middle, half) if self.from_below else 0.0
+        else:
+            above, below = self._alone(middle, half)
+        least, most = max(part.least, below), min(part.most, above)
+        axis = int(np.argmax(half * self.weights))
+        return replace(part, least=min(least, most), most=most, axis=axis, judged=True)
+
+    def _alone(self, middle: Array, half: Array) -> tuple[float, float]:
+        """Upper and lower bounds that hold from every start of a cell, by the linear response of its own."""
         centre = self.start.mean + self.gains @ middle
         slack = 1e-13 * (np.abs(self.start.mean) + np.abs(self.gains) @ (np.abs(middle) + half)) + 1e-290
         generators = np.concatenate([(self.gains * half).T, np.diag(slack)])
@@ -132,29 +142,13 @@ class NoisyStart:
         cell = Cells(centres=centre[None], boxes=boxes[None], generators=generators[None], start_error=self.error)
         delta = min(max(_TARGET * float(self.problem.delta), 1e-12), _LARGEST)
         problem = self.problem.replace(initial=GaussianStart(centre, self.rest), delta=delta)
-        least, most = part.least, part.most
-        try:
-            level = linear_answer(problem, cells=cell, thorough=False, quick=True).log10_delta
-            most = min(most, 10.0**level * _UP)
-        except (CertboundError, ArithmeticError):
-            pass
-        if most > _TARGET / 10 and self.from_below:
-            try:
-                least = max(least, least_failing_of(problem, cell) * _DOWN)
-            except (CertboundError, ArithmeticError):
-                pass
-        return replace(part, least=min(least, most), most=most, axis=axis, judged=True)
-
-    @property
-    def weights(self) -> Array:
-        """How much a deviation along each direction moves the constraints."""
-        return np.linalg.norm(self._seen @ self.gains, axis=0)
-
-    @property
-    def _seen(self) -> Array:
-        if not hasattr(self, "_effects"):
-            self._effects = effects(self.problem, Linearisation.of(self.problem))
-        return self._effects
+        above, below = 1.0, 0.0
+        with contextlib.suppress(CertboundError, ArithmeticError):
+            above = min(10.0 ** linear_answer(problem, cells=cell, thorough=False, quick=True).log10_delta * _UP, 1.0)
+        if above > _TARGET / 10 and self.from_below:
+            with contextlib.suppress(CertboundError, ArithmeticError):
+                below = least_failing_of(problem, cell) * _DOWN
+        return above, below
 
 
 def gaussian_noise(problem: Problem) -> bool:
@@ -163,10 +157,12 @@ def gaussian_noise(problem: Problem) -> bool:
     return not depends_on_state(problem) and (not isinstance(system, DiscreteSystem) or system.noise.gaussian)
 
 
-def _divided(problem: Problem) -> tuple[Array, Array, Array]:
-    """Gains (n, d), the covariance R of what is left in floats, and an entrywise bound of its error."""
+def _divided(problem: Problem, seen: Array) -> tuple[Array, Array, Array]:
+    """Gains (n, d), the covariance R of what is left in floats, and an entrywise bound of its error.
+
+    ``seen`` (m, n) are rows along which the constraints see the start.
+    """
     start = problem.initial
-    seen = effects(problem, Linearisation.of(problem))
     scale = np.sqrt(np.diag(start.covariance))
     unit = np.where(scale > 0, scale, 1.0)
     random = scale > 0

@@ -11,14 +11,14 @@ from certbound.errors import EngineError
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
-from certbound.problem.sets import Faces, is_spread
+from certbound.problem.sets import Faces
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.reach.linear import Linearisation
 from certbound.reach.remainder import hidden_jump
-from certbound.reach.starts.averages import StartBounds, StartCells
-from certbound.reach.starts.directions import start_directions
-from certbound.reach.starts.limits import Limit
-from certbound.reach.starts.paths import node_maps, start_paths
+from certbound.reach.starts.cell_masses import StartBounds, StartCells
+from certbound.reach.starts.crossed_limits import Limit
+from certbound.reach.starts.drawn_directions import start_directions
+from certbound.reach.starts.drawn_paths import node_maps, start_paths
 
 _DIRECTIONS = 8  # that are cut into cells
 _SKETCH = 300  # cells, from which the size of the probability is seen
@@ -29,7 +29,7 @@ _MISSED = 1e-4  # of the probability: what the directions that are not cut may l
 def unserved(problem: Problem) -> str | None:
     """Why a random start is not averaged over in cells; None where it is."""
     box = problem.system.disturbance
-    if not is_spread(problem.initial):
+    if not problem.initial.spread:
         return "the start is not random."
     if problem.endless or problem.reach is not None or problem.hold is not None:
         return "cells of a random start need a finite horizon, constraints only, and inputs that are not held."

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -29,12 +31,12 @@ def test_cells_of_a_linear_model_come_near_what_is_simulated_from_both_sides() -
     problem = turning()
     seen: list[float] = []
     found = bound_noisy_start(problem, most=250, enough=never, found=lambda bounds: seen.append(bounds.upper))
-    simulated = cb.simulate_exits(problem, paths=200_000, seed=1)
+    simulated = cb.simulate_exits(problem, paths=200_000)
     assert found.lower <= simulated.upper
     assert found.upper >= simulated.lower
     assert 0.5 * simulated.probability < found.lower
     assert found.upper < 1.7 * simulated.probability
-    assert seen == sorted(seen, reverse=True)
+    assert all(later <= (1 + 1e-9) * first for first, later in itertools.pairwise(seen))
 
 
 def test_without_spread_there_is_nothing_to_cut_and_a_singular_covariance_is_refused() -> None:
@@ -65,5 +67,5 @@ def test_obstacles_and_curved_models_are_bounded_by_the_engine_of_each_cell() ->
     problem = cb.Problem(still, initial=start, safe=[ball], horizon=8, delta=0.01)
     found = bound_noisy_start(problem, most=24, enough=never)
     simulated = cb.simulate_exits(problem, paths=50_000)
-    assert 0 < found.lower <= simulated.upper
-    assert simulated.lower <= found.upper
+    assert found.lower <= simulated.upper
+    assert simulated.lower <= found.upper < 0.75  # the mean meets the ball, and without cells nothing below 1 is proved

@@ -18,7 +18,7 @@ from certbound.constants.enclosures import enclose
 from certbound.errors import EngineError
 from certbound.problem.model import Tape
 from certbound.problem.sets import Faces, Inside, Quadratic
-from certbound.reach.starts.paths import StartPaths
+from certbound.reach.starts.drawn_paths import StartPaths
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
 
@@ -133,7 +133,7 @@ class Limit:
         return np.asarray(low - (np.abs(toward) * points.slack).sum(axis=-1) - self.radius[1] * (1 + _ROUND))
 
     def effects(self, piece: _Points, middle: Array, half: Array) -> Array:
-        """How much each direction of a cell hides whether a piece of its own (B pieces) keeps the constraint: (B, d)."""
+        """How much each direction of a cell hides whether the piece of its number keeps the constraint: (B, d)."""
         place = (piece.value + np.einsum("bckd,bd->bck", piece.gains, middle)).mean(axis=1)
         gains = piece.gains.mean(axis=1)
         moved = np.abs(gains) * half[:, None]
@@ -235,8 +235,7 @@ def _nodes(paths: StartPaths, first: float, last: float, horizon: float) -> tupl
 
 def _points(whole: _Points, span: Interval, first: float, last: float, horizon: float) -> _Points:
     """Single times at which the constraint holds, from the control points of the pieces that they are in."""
-    count, degree = len(whole.value), whole.value.shape[1] - 1
-    if not degree:
+    if whole.value.shape[1] == 1:
         return whole.chosen((span.lo >= first) & (span.hi <= last))
     found = []
     begin = np.append(span.lo[1:], horizon)
@@ -248,10 +247,10 @@ def _points(whole: _Points, span: Interval, first: float, last: float, horizon: 
         inside[0] |= share == 0 and first <= 0 <= last
         inside[-1] |= share == 1 and first <= horizon <= last
         inside[:-1] &= share < 1
-        def blended(values: Array) -> Array:
-            return np.einsum("c,mc...->m...", weights, values)[:, None]  # noqa: B023  (called at once)
-        points = _Points(
-            value=blended(whole.value), gains=blended(whole.gains), rest=blended(whole.rest), slack=whole.slack
-        )
-        found.append(points.chosen(inside))
-    return _Points(**{name: np.concatenate([getattr(part, name) for part in found]) for name in _Points.__dataclass_fields__})
+        blended = {
+            name: np.einsum("c,mc...->m...", weights, getattr(whole, name))[:, None]
+            for name in ("value", "gains", "rest")
+        }
+        found.append(_Points(**blended, slack=whole.slack).chosen(inside))
+    names = _Points.__dataclass_fields__
+    return _Points(**{name: np.concatenate([getattr(part, name) for part in found]) for name in names})

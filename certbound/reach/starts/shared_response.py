@@ -14,9 +14,9 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Faces, Inside
 from certbound.reach.linear import Linearisation, LinearRun, Share
 from certbound.reach.nominal import Cells
-from certbound.reach.starts.directions import StartDirections
-from certbound.reach.starts.limits import Limit
-from certbound.reach.starts.paths import start_paths
+from certbound.reach.starts.crossed_limits import Limit
+from certbound.reach.starts.drawn_directions import StartDirections
+from certbound.reach.starts.drawn_paths import start_paths
 from certbound.rigor.intervals import Interval
 
 _SHARE = 0.002  # of delta, for what windows of time cost in common
@@ -48,13 +48,15 @@ class SharedResponse:
         self.common = float(events.shared_log)
         paths, self.faces = start_paths(self.engine, start), []
         count, nodes, rows, levels, gains = paths.pieces, [], [], [], []
-        for constraint in problem.kept:
+        for number, constraint in enumerate(problem.kept):
             limit = Limit(constraint, paths, float(problem.horizon))
             normals = constraint.region.lifted(constraint.region.form.normals, self.engine.n)
             own = limit.points.chosen(limit.at_nodes)
             for m, normal in enumerate(normals):
                 event = events.along(np.broadcast_to(normal, (count, len(normal))).copy())
                 self.faces.append((limit, m, event))
+                if number >= len(problem.safe):
+                    continue  # beyond its domain the model says nothing
                 bound = float(constraint.region.form.bounds[m])
                 nodes.append(limit.nodes)
                 rows.append(np.broadcast_to(normal, (len(limit.nodes), len(normal))))
@@ -64,7 +66,7 @@ class SharedResponse:
             nodes=np.concatenate(nodes), rows=np.concatenate(rows), levels=np.concatenate(levels),
             lost=np.zeros(sum(map(len, levels))),
         )  # fmt: skip
-        self.gains, self.known = np.concatenate(gains), -1
+        self.gains = np.concatenate(gains)
         self._thin()
 
     def _thin(self) -> None:

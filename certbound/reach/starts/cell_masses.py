@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array, Integers, Mask
-from certbound.reach.starts.directions import FAR, StartDirections
-from certbound.reach.starts.limits import Limit
+from certbound.reach.starts.crossed_limits import Limit
+from certbound.reach.starts.drawn_directions import FAR, StartDirections
 from certbound.watch import poll
 
 _PARTS = 0.9  # of the undecided mass, whose cells are halved in a round
 _MOST = 1500  # cells halved in a round
-_CLOSE = 1.02  # ratio of the bounds at which nothing is gained by smaller cells
 _TOGETHER = 64  # cells that are judged together
 _ROUND = 1e-12
 _OPEN, _KEPT, _BROKEN = 0, 1, 2
@@ -27,7 +26,7 @@ _OPEN, _KEPT, _BROKEN = 0, 1, 2
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StartBounds:
-    """P(fail) within [``lower``, ``upper``]; ``shares`` are masses that surely break, by the constraint's number."""
+    """P(fail) within [``lower``, ``upper``]; ``shares`` are masses of cells that break each constraint."""
 
     lower: float
     upper: float
@@ -43,22 +42,22 @@ class StartCells:
         self.low = np.full((1, start.count), -FAR)
         self.high = np.full((1, start.count), FAR)
         self.least, self.most = start.mass(self.low, self.high)
-        self.fate, self.by, self.axis = self._judged(self.low, self.high)
+        self.status, self.by, self.axis = self._judged(self.low, self.high)
 
     def bounds(self) -> StartBounds:
         """What the cells prove together."""
-        failing = self.fate == _BROKEN
+        failing = self.status == _BROKEN
         lower = float(np.sum(self.least[failing])) * (1 - _ROUND) - self.start.missed
-        upper = float(np.sum(self.most[self.fate != _KEPT])) * (1 + _ROUND) + self.start.missed + self.start.beyond
+        upper = float(np.sum(self.most[self.status != _KEPT])) * (1 + _ROUND) + self.start.missed + self.start.beyond
         shares = tuple(float(self.least[failing & (self.by == k)].sum()) for k in range(len(self.broken)))
         return StartBounds(lower=max(lower, 0.0), upper=min(upper, 1.0), cells=len(self.low), shares=shares)
 
     def refine(self, most: int, enough: Callable[[StartBounds], bool]) -> StartBounds:
-        """Halve cells until the bounds are close or enough, or there are ``most``."""
+        """Halve cells until the bounds are enough, or there are ``most``."""
         while True:
             found = self.bounds()
-            open_ = np.flatnonzero((self.fate == _OPEN) & (self.most > 0))
-            if not len(open_) or len(self.low) >= most or enough(found) or found.upper <= _CLOSE * found.lower:
+            open_ = np.flatnonzero((self.status == _OPEN) & (self.most > 0))
+            if not len(open_) or len(self.low) >= most or enough(found):
                 return found
             poll(f"cells of the random start ({len(self.low)})")
             order = open_[np.argsort(-self.most[open_], kind="stable")]
@@ -73,9 +72,9 @@ class StartCells:
         high[2 * rows, axis] = cut
         low[2 * rows + 1, axis] = cut
         least, most = self.start.mass(low, high)
-        fate, by, axes = self._judged(low, high)
-        for name, new in (("low", low), ("high", high), ("least", least), ("most", most), ("fate", fate), ("by", by),
-                          ("axis", axes)):
+        status, by, axes = self._judged(low, high)
+        names = ("low", "high", "least", "most", "status", "by", "axis")
+        for name, new in zip(names, (low, high, least, most, status, by, axes)):
             old = np.delete(getattr(self, name), chosen, axis=0)
             setattr(self, name, np.concatenate([old, new]))
 
@@ -83,17 +82,17 @@ class StartCells:
         """Whether cells keep or break the constraints, by which one they break, and along which axis to halve them."""
         middle = (low + high) / 2
         half = np.maximum(high - middle, middle - low) * (1 + 1e-15)
-        fate, by, axis = (np.zeros(len(low), dtype=np.int64) for _ in range(3))
+        status, by, axis = (np.zeros(len(low), dtype=np.int64) for _ in range(3))
         order = np.lexsort(middle.T[::-1])
         for begin in range(0, len(low), _TOGETHER):  # neighbours, which keep the constraints on much the same pieces
             own = order[begin : begin + _TOGETHER]
             kept, hidden = self._kept(middle[own], half[own])
             rest = own[~kept]
             broken, number = self._broken(middle[rest], half[rest])
-            fate[own[kept]], fate[rest[broken]], by[rest] = _KEPT, _BROKEN, number
+            status[own[kept]], status[rest[broken]], by[rest] = _KEPT, _BROKEN, number
             hidden = np.where(hidden.max(axis=1, keepdims=True) > 0, hidden, half[own])
             axis[own] = np.argmax(hidden, axis=1)
-        return fate, by, axis
+        return status, by, axis
 
     def _kept(self, middle: Array, half: Array) -> tuple[Mask, Array]:
         """Which cells keep every constraint, and how much each direction hides that, (B,) and (B, d)."""
@@ -124,4 +123,5 @@ class StartCells:
 def halved(low: Array, high: Array) -> Array:
     """Where an interval is halved: in its middle, or one deviation from the end that is nearer to 0."""
     middle = (low + high) / 2
-    return np.where(low >= 0, np.minimum(middle, low + 1.0), np.where(high <= 0, np.maximum(middle, high - 1.0), middle))
+    below = np.where(high <= 0, np.maximum(middle, high - 1.0), middle)
+    return np.where(low >= 0, np.minimum(middle, low + 1.0), below)

@@ -12,7 +12,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.reach.linear import Linearisation, LinearRun
-from certbound.reach.starts.directions import FAR, StartDirections
+from certbound.reach.starts.drawn_directions import FAR, StartDirections
 from certbound.rigor.intervals import Interval
 
 _ROUND = 1e-13  # of all terms' sizes: more than a few dozen products and sums lose
