@@ -218,7 +218,7 @@ def test_the_verdict_asks_it_among_the_others(boxes: None, file: str) -> None:
     assert alone.status == "SAFE"
     assert alone.reason.endswith("even one that sees coming noise.")
     assert verdict.log10_delta <= alone.log10_delta
-    with pytest.raises(ValueError, match=r"must be one of auto, linear, .*, boxes, .*got 'boxen'"):
+    with pytest.raises(ValueError, match=r"must be one of auto, starts, linear, .*, boxes, .*got 'boxen'"):
         cb.verify_safety(problem, method="boxen")
 
 
