@@ -19,7 +19,7 @@ from certbound.display import rounded
 from certbound.errors import EngineError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Ellipsoid
-from certbound.reach.starts import StartBounds, bound_noisy_start, bound_silent_start, is_silent
+from certbound.reach.starts import StartBounds, bound_noisy_start, bound_silent_start, in_half_spaces, is_silent
 from certbound.rigor.balls import precision, upper
 from certbound.safety.answers import AS_IT_IS, SPARED, EngineAnswer, Request, is_at_most
 
@@ -27,6 +27,7 @@ Prove = Callable[[Problem, Request], EngineAnswer]
 
 _SILENT = (20_000, 200_000)  # cells where the start alone is random: usually, and at length
 _NOISY = (60, 1000, 20_000)  # cells where noise follows: at first, thoroughly, at length
+_MANY = 4  # states from which on cells of all directions are too many to stay within half-spaces
 _CLOSE = 1.1  # ratio of the bounds below which no other engine is needed
 _RATIO = 1.02  # ratio at which cells are small enough
 _SHARES = (0.1, 0.3, 0.7)  # of delta, at most, for starts outside the ellipsoid: the first that is a safe start
@@ -105,20 +106,27 @@ def starts_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     def found(bounds: StartBounds) -> None:
         asked.found(_answer(problem, bounds))
 
-    if is_silent(problem):
-        try:
-            most = _SILENT[asked.at_length]
-            return _answer(problem, bound_silent_start(problem, most=most, enough=_near, found=found))
-        except EngineError as error:
-            if "linear" not in str(error):
-                raise
-    level = 2 if asked.at_length else int(asked.thorough)
+    def by_cells() -> EngineAnswer:
+        most = _SILENT[asked.at_length]
+        return _answer(problem, bound_silent_start(problem, most=most, enough=_near, found=found))
+
+    silent = is_silent(problem)
+    many = problem.system.dimension >= _MANY and in_half_spaces(problem)
+    if silent and not many:
+        with contextlib.suppress(EngineError):
+            return by_cells()
     patient = asked.at_length or asked.thorough
 
     def decided(bounds: StartBounds) -> bool:
         return _near(bounds) or (not patient and _settles(problem, bounds))
 
-    return _answer(problem, bound_noisy_start(problem, most=_NOISY[level], enough=decided, found=found))
+    most = _NOISY[2 if asked.at_length else int(asked.thorough)]
+    try:
+        return _answer(problem, bound_noisy_start(problem, most=most, enough=decided, found=found))
+    except EngineError:
+        if not (silent and many):
+            raise
+        return by_cells()
 
 
 def _near(found: StartBounds) -> bool:
