@@ -50,14 +50,16 @@ class SharedResponse:
         count, nodes, rows, levels, gains = paths.pieces, [], [], [], []
         for number, constraint in enumerate(problem.kept):
             limit = Limit(constraint, paths, float(problem.horizon))
-            normals = constraint.region.lifted(constraint.region.form.normals, self.engine.n)
+            form = constraint.region.form
+            assert isinstance(form, Faces)
+            normals = constraint.region.lifted(form.normals, self.engine.n)
             own = limit.points.chosen(limit.at_nodes)
             for m, normal in enumerate(normals):
                 event = events.along(np.broadcast_to(normal, (count, len(normal))).copy())
                 self.faces.append((limit, m, event))
                 if number >= len(problem.safe):
                     continue  # beyond its domain the model says nothing
-                bound = float(constraint.region.form.bounds[m])
+                bound = float(form.bounds[m])
                 nodes.append(limit.nodes)
                 rows.append(np.broadcast_to(normal, (len(limit.nodes), len(normal))))
                 levels.append(bound - own.value[:, 0, m] + own.slack[:, m])
