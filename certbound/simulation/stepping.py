@@ -31,7 +31,7 @@ class Scenario:
 
     # Continuous time only. ``auto`` takes the exact transition of a linear system of up to 16 states, Milstein's scheme
     # where the diffusion is diagonal and entry i depends on state i alone, and Euler-Maruyama otherwise; where that
-    # would need shorter steps, and the diffusion is constant, the exponential scheme of ``stiffness``.
+    # would need shorter steps than a thousandth of the horizon, the exponential scheme of ``stiffness``.
     scheme: Literal["auto", "exact", "milstein", "euler"] = "auto"
     bridge: bool = True  # continuous time only: look for exits between two steps with a Brownian bridge
     # (n,): one start for all paths; otherwise X_0 is uniform in the problem's initial set (or drawn from its law)
@@ -53,6 +53,19 @@ class Scenario:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Exponential:
+    """Matrices (n, n) of the exponential midpoint rule, over one step h; see ``stiffness``.
+
+    Pairs of steps share one rest of the drift, N(x) = f(x) - base x, taken where the first of them ends.
+    """
+
+    base: Array  # J, 1/s
+    move: Array  # e^{h J}
+    response: Array  # int_0^h e^{s J} ds: what the rest of the drift adds in a step
+    lead: Array  # what it adds to the state where it is taken anew
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class StepModel:
     """One step of a system, as numbers and tapes."""
 
@@ -69,8 +82,8 @@ class StepModel:
     unit: Tape | None = None  # z as a function of v, entry by entry; without it z = v
     # (n, m): what multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
     noise: Array | Tape
-    # (n, n), of the exponential scheme: without noise the state moves by ``flow`` times the drift
-    flow: Array | None = None
+    exponential: Exponential | None = None  # how the state moves without noise, where not by Euler's scheme
+    pieces: int = 1  # parts of a step, each with variates of its own; of a tape of noise they are added up
     correction: Tape | None = None  # diagonal of d g_ii/d x_i, for Milstein's scheme
     # (n, m): g sqrt(h) of the bridge between two steps; None in discrete time, and where ``noise`` is a tape
     spread: Array | None = None
@@ -86,12 +99,13 @@ class StepModel:
     # inputs that are held, the first ones: a function of (t, states), computed every so many steps
     law: Tape | None = None
     every: int = 0
+    constant: int = 0  # steps after which inputs may change, where they do so at equal distances; else 0
     scheme: str = "discrete"  # what was chosen: ``exact``, ``milstein``, ``euler``, ``exponential`` or ``discrete``
 
     @property
     def noise_count(self) -> int:
-        """Number m of variates that a step needs."""
-        return int(self.noise.shape[1])
+        """Number of variates that a step needs."""
+        return int(self.noise.shape[1]) * (self.pieces if isinstance(self.noise, Tape) else 1)
 
     @property
     def held_count(self) -> int:
@@ -132,6 +146,8 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
         inputs, disturbances = inputs + disturbances, 0
     fields |= {"input_count": inputs, "disturbance_count": disturbances}
     fields["table"] = np.hstack(rows) if rows else np.zeros((0, 0))
+    pieces = problem.samples if held else len(sequence) if sequence is not None and len(rows) == 1 else 0
+    fields["constant"] = steps // pieces if pieces and steps % pieces == 0 else 0
     if system.time == "discrete":
         law: Law = system.noise
         check_law(law, "be simulated")

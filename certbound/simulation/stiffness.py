@@ -1,8 +1,17 @@
 """Whether steps of a scheme are short enough for a model, and the scheme that bears long ones.
 
-Euler's step multiplies a mode of rate l = a + b i of the drift's Jacobian J by 1 + h l, where e^{h l} is right: it
+Euler's step multiplies a mode of rate l = a + b i of the drift's Jacobian by 1 + h l, where e^{h l} is right: it
 takes the rate a for log|1 + h l|/h, about a + h (b^2 - a^2)/2. A swing of 197 1/s that is damped by 10 1/s grows at
-h = 1 ms. A scheme that moves the state by Phi f multiplies by the eigenvalues of I + Phi J.
+h = 1 ms.
+
+The exponential midpoint rule splits the drift into J x and a rest N. In a pair of steps of length h,
+
+    c = E x + A N(x) + w_1,   y = E x + P N(c) + w_1,   z = E y + P N(c) + w_2,   E = e^{h J},  P = int_0^h e^{s J} ds,
+
+with w_1, w_2 ~ N(0, int_0^h e^{s J} g g' e^{s J'} ds): exact where N is constant, of weak order 2 where g is (Hochbruck
+and Ostermann, Exponential integrators, 2010). A is P on modes that die out within a step, so that c stays on slow
+manifolds, and h elsewhere: where N is a force, a function of positions that acts on velocities, N(c) is then N(E x +
+w_1), the rule is symmetric in time, and adds no damping and no energy to a swing, however light.
 """
 
 from __future__ import annotations
@@ -14,7 +23,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.problem.model import Tape, compile_numpy, compile_scalar, jacobian
-from certbound.simulation.stepping import StepModel
+from certbound.simulation.stepping import Exponential, StepModel
 from certbound.simulation.transition import bridge_shares, exact_transition
 
 _TOLERANCE = 0.2
@@ -22,6 +31,7 @@ _PIECES = 40  # of the noise-free path on which Jacobians are looked at
 _LOOKS = 5
 _HALVINGS = 30
 _FASTEST = 50.0  # e-foldings of a piece beyond which the path is not followed
+_OBLIQUE = 1e6  # norm of a projection beyond which modes are not told apart
 _DEAD = 0.3  # a mode that falls by more within a step follows the others, and only has to fall so far in the scheme
 
 _Matrices = Array  # (k, n, n)
@@ -73,7 +83,8 @@ def jacobians(model: StepModel, steps: int, start: Any) -> _Matrices:
 def step_error(matrices: _Matrices, step: float, horizon: float, base: Array | None = None) -> float:
     """The largest error of a mode's rate, over what is allowed: a fifth of it, or of one e-folding in the horizon.
 
-    Of Euler's scheme; with ``base`` of the scheme that is exact where J is that, infinite where that has no numbers.
+    Of Euler's scheme; with ``base`` of the exponential one that is exact where J is that, infinite where it has no
+    numbers.
 
     Examples
     --------
@@ -83,23 +94,31 @@ def step_error(matrices: _Matrices, step: float, horizon: float, base: Array | N
     >>> step_error(swing, 1e-3, 1.0, swing[0]) < 1e-9
     True
     """
-    worst = 0.0
-    move = None if base is None else _propagator(base, step)
+    worst, scheme = 0.0, None if base is None else exponential_step(base, step)
+    if scheme is not None and not all(np.all(np.isfinite(m)) for m in (scheme.move, scheme.response, scheme.lead)):
+        return float("inf")
     for matrix in matrices:
         rates = np.linalg.eigvals(matrix)
-        with np.errstate(divide="ignore"):
-            if move is None:
-                grown, right = np.log(np.abs(1.0 + step * rates)), step * rates.real
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            if scheme is None:
+                span, grown, right = step, np.log(np.abs(1.0 + step * rates)), step * rates.real
             else:
-                scheme = np.eye(len(matrix)) + move @ matrix
-                if not np.all(np.isfinite(scheme)):
+                span, pair = 2.0 * step, _pair(scheme, matrix)
+                if not np.all(np.isfinite(pair)):
                     return float("inf")
-                moved = np.abs(np.linalg.eigvals(scheme))
+                moved = np.sort(np.abs(np.linalg.eigvals(pair)))
                 rates = rates[np.argsort(rates.real)]
-                grown, right = (np.maximum(x, np.log(_DEAD)) for x in (np.log(np.sort(moved)), step * rates.real))
-        allowed = _TOLERANCE * step * np.maximum(np.abs(rates.real), 1.0 / horizon)
+                grown, right = (np.maximum(x, np.log(_DEAD)) for x in (np.log(moved), span * rates.real))
+        allowed = _TOLERANCE * span * np.maximum(np.abs(rates.real), 1.0 / horizon)
         worst = max(worst, float(np.max(np.abs(grown - right) / allowed)))
     return worst
+
+
+def _pair(scheme: Exponential, matrix: Array) -> Array:
+    """The matrix of a pair of steps of the exponential scheme where the drift is ``matrix`` x."""
+    rest = matrix - scheme.base
+    taken = rest @ (scheme.move + scheme.lead @ rest)
+    return scheme.move @ (scheme.move + scheme.response @ taken) + scheme.response @ taken
 
 
 def steps_needed(matrices: _Matrices, steps: int, horizon: float, base: Array | None = None) -> int:
@@ -111,25 +130,52 @@ def steps_needed(matrices: _Matrices, steps: int, horizon: float, base: Array | 
     return steps
 
 
-def exponential(model: StepModel, base: Array, diffusion: Array) -> StepModel:
-    """The model with steps that are exact where the drift is linear with Jacobian ``base``.
+def exponential_step(base: Array, step: float) -> Exponential:
+    """The matrices of the exponential midpoint rule that is exact where the drift is linear with Jacobian ``base``."""
+    with np.errstate(all="ignore"):
+        move, response = _propagator(base, step)
+        lead = step * np.eye(len(base))
+        if np.all(np.isfinite(response)):
+            lead += (response - lead) @ _fast_modes(base, step)
+    return Exponential(base=base, move=move, response=response, lead=lead)
 
-    x+ = x + Phi f(x) + N(0, S), Phi = int_0^h e^{s J} ds, S = int_0^h e^{s J} g g' e^{s J'} ds (exponential Euler).
-    """
-    n = model.dimension
-    move, _, factor = exact_transition(np.hstack([base, np.eye(n)]), np.zeros(n), diffusion, model.step)
-    spread = bridge_shares(base, diffusion, model.step)[:, None] * diffusion * np.sqrt(model.step)
-    return replace(model, flow=move[:, n:], noise=factor, spread=spread, scheme="exponential")
+
+def exponential(model: StepModel, base: Array) -> StepModel:
+    """The model with steps of the exponential midpoint rule; noise that depends on the state acts in their middle."""
+    scheme = exponential_step(base, model.step)
+    if isinstance(model.noise, Tape):
+        return replace(model, exponential=scheme, scheme="exponential")
+    diffusion = model.noise / np.sqrt(model.step)
+    _, _, factor = exact_transition(base, np.zeros(model.dimension), diffusion, model.step)
+    spread = bridge_shares(base, diffusion, model.step)[:, None] * model.noise
+    return replace(model, exponential=scheme, noise=factor, spread=spread, scheme="exponential")
 
 
-def _propagator(base: Array, step: float) -> Array:
-    """int_0^h e^{s J} ds."""
+def _fast_modes(base: Array, step: float) -> Array:
+    """The projection on the modes that die out within a step, along the others; all where these are not apart."""
+    from scipy.linalg import schur, solve_sylvester
+
+    n = len(base)
+    form, turn, count = schur(base, output="complex", sort=lambda rate: rate.real * step < -1.0)
+    if count in (0, n):
+        return np.eye(n) * (count > 0)
+    coupling = solve_sylvester(form[:count, :count], -form[count:, count:], -form[:count, count:])
+    if not np.linalg.norm(coupling) < _OBLIQUE:
+        return np.eye(n)
+    inner = np.zeros((n, n), dtype=complex)
+    inner[:count, :count], inner[:count, count:] = np.eye(count), -coupling
+    return np.asarray((turn @ inner @ turn.conj().T).real)
+
+
+def _propagator(base: Array, step: float) -> tuple[Array, Array]:
+    """e^{h J} and int_0^h e^{s J} ds."""
     from scipy.linalg import expm
 
     n = len(base)
     block = np.zeros((2 * n, 2 * n))
     block[:n, :n], block[:n, n:] = base, np.eye(n)
-    return np.asarray(expm(block * step)[:n, n:])
+    whole = np.asarray(expm(block * step))
+    return whole[:n, :n], whole[:n, n:]
 
 
 def _diffusion(model: StepModel, x: Array) -> Array:

@@ -215,7 +215,7 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
     """Source of the splitting kernel, which runs one particle on from a step; see `compiled.particles`."""
     p = start_text(model)
     functions = function_lines(model, p)
-    step, bridge = step_lines(model, p)
+    step, bridge = step_lines(model, p, "first")
     begin, within, end = score_source(barriers, bridge, p)
     n = model.dimension
     load = [*load_lines(model, "states[path, first, {0}]", p), "top = tops[path, first]"]
@@ -223,7 +223,7 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
     store = [*each("states[path, k + 1, {0}] = y_{0}", n, p), "tops[path, k + 1] = top"]
     if own:
         load += each("a_{0} = frees[path, first, {0}]", n, p)
-        free = nominal_lines(model, p)
+        free = nominal_lines(model, p, "first")
         store += each("frees[path, k + 1, {0}] = b_{0}", n, p)
         end = [*end, *each("a_{0} = b_{0}", n, p)]
     full = ["hold(tops, path, k + 1, top)", "break"]
