@@ -41,7 +41,7 @@ from numba import njit
 
 from certbound.simulation.compiled.elementary import atan2, sincos, tanh
 from certbound.simulation.compiled.entry import KERNEL
-from certbound.simulation.compiled.streams import draw_{variate}, uniform
+from certbound.simulation.compiled.streams import draw_{variate}, stream_of, uniform
 from certbound.simulation.compiled.supremum import STRETCH, bin_of, crossed, raise_top, rise_between, touches
 
 '''
@@ -61,7 +61,8 @@ def kernel_source(model: StepModel, task: Task) -> tuple[str, Array]:
     """Source of the kernel and the parameter array ``p`` that it reads.
 
     The module defines ``run``, whose arrays are prepared by `certbound.simulation.blocks`. It returns the
-    number of steps done, or -1 after writing (path, step, state) of the last finite state to ``notes``.
+    number of steps done, or -1 after writing (path, step, state) of the last finite state to ``notes``. Exits are
+    written to ``out`` too, where it has rows, path by path; each path then has a stream of its own for its noise.
     """
     p = start_text(model)
     functions = function_lines(model, p)
@@ -69,6 +70,8 @@ def kernel_source(model: StepModel, task: Task) -> tuple[str, Array]:
     begin, within, end, finish = task_source(task, model.dimension, bridge, nominal_lines(model, p), p)
     start = [*load_lines(model, "starts[path, {0}]", p), *begin]
     loop = [*step, *within, *each("x_{0} = y_{0}", model.dimension, p), *end]
+    if task.kind == "exits":
+        start = ["if out.shape[0] > 0:", f"    {_WORDS} = stream_of(stream, path)", *start]
     path = [*start, "for k in range(steps):", *indent(loop), *finish]
     body = [*open_noise(model, p), "done = 0", "for path in range(starts.shape[0]):", *indent(path), "return done"]
     text = module_text(model, task.kind, functions, p) + SIGNATURE + kernel_body(body, p)

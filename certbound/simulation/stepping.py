@@ -82,6 +82,7 @@ class StepModel:
     unit: Tape | None = None  # z as a function of v, entry by entry; without it z = v
     # (n, m): what multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
     noise: Array | Tape
+    carry: Array | None = None  # (n, n): what a step makes of noise of the step before; None: nothing
     exponential: Exponential | None = None  # how the state moves without noise, where not by Euler's scheme
     pieces: int = 1  # parts of a step, each with variates of its own; of a tape of noise they are added up
     correction: Tape | None = None  # diagonal of d g_ii/d x_i, for Milstein's scheme
@@ -242,7 +243,7 @@ def _continuous(
         transition, offset, factor = exact_transition(*linear, np.asarray(diffusion), step)
         drift = _affine_tape(tape.inputs, np.hstack([np.zeros((n, 1)), transition]), offset)
         spread *= bridge_shares(linear[0][:, :n], np.asarray(diffusion), step)[:, None]
-        return StepModel(drift=drift, noise=factor, spread=spread, scheme="exact", **fields)
+        return StepModel(drift=drift, noise=factor, spread=spread, carry=transition[:, :n], scheme="exact", **fields)
     if wanted in ("exact", "milstein"):
         need = "a linear system with constant coefficients" if wanted == "exact" else "a state-dependent diffusion"
         raise ValueError(f"`scheme` {wanted!r} needs {need}; use 'auto'.")

@@ -148,7 +148,9 @@ def exponential(model: StepModel, base: Array) -> StepModel:
     diffusion = model.noise / np.sqrt(model.step)
     _, _, factor = exact_transition(base, np.zeros(model.dimension), diffusion, model.step)
     spread = bridge_shares(base, diffusion, model.step)[:, None] * model.noise
-    return replace(model, exponential=scheme, noise=factor, spread=spread, scheme="exponential")
+    return replace(
+        model, exponential=scheme, noise=factor, spread=spread, carry=scheme.move, scheme="exponential"
+    )
 
 
 def _fast_modes(base: Array, step: float) -> Array:
