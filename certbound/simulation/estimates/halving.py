@@ -19,6 +19,9 @@ from certbound.simulation.estimates.statistics import bound_binomial
 from certbound.simulation.stepping import Scenario, StepModel, step_model
 from certbound.simulation.stiffness import exponential
 
+OTHER = 2**128 - 1
+"""Turns the bits of a run's seed into those of the run with half of the step."""
+
 _ALL, _SHARE = 32 * BLOCK, 8
 """Paths up to which all are simulated with half of the step too (4e7 steps more, of 1000 a path and step: half a
 second), and of more paths the share: they take .4 of the time of the rest."""

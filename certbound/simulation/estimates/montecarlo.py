@@ -13,7 +13,15 @@ from certbound.arrays import Array
 from certbound.problem.problem import DOMAIN
 from certbound.simulation.blocks import Counts, Work, check_count
 from certbound.simulation.checkpoint import seed_of
-from certbound.simulation.estimates.halving import PairedWork, StepEffect, composed, halved, paired_paths, step_effect
+from certbound.simulation.estimates.halving import (
+    OTHER,
+    PairedWork,
+    StepEffect,
+    composed,
+    halved,
+    paired_paths,
+    step_effect,
+)
 from certbound.simulation.estimates.preparation import Setting, prepare
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
 from certbound.simulation.executors import Progress, run_work
@@ -23,7 +31,6 @@ from certbound.simulation.stepping import Scenario, StepModel
 from certbound.simulation.tasks import Task
 
 _TIME_BINS = 200
-_OTHER = 2**128 - 1  # turns the bits of a run's seed into those of its pairs
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -203,7 +210,7 @@ def _work(problem: Any, setting: Setting, model: StepModel, kind: type[Work] = W
 def _paired(problem: Any, setting: Setting, scenario: Scenario | None, work: Work, ignored: int) -> PairedWork:
     """The work that counts exits with the step, and with half of it, of the same paths; none of those of ``work``."""
     fine = halved(problem, setting, scenario)
-    rows, both = work.counts_shape[0], {"paths": paired_paths(work.paths), "entropy": work.entropy ^ _OTHER}
+    rows, both = work.counts_shape[0], {"paths": paired_paths(work.paths), "entropy": work.entropy ^ OTHER}
     coarse = _work(problem, setting, composed(setting.model, fine.model), counts_shape=(rows, 2), **both)
     fields = {"coarse": coarse, "rows": rows, "ignored": ignored, "counts_shape": (1, 3)}
     return cast(PairedWork, _work(problem, fine, fine.model, PairedWork, **fields, **both))
