@@ -28,7 +28,10 @@ from certbound.simulation.wide_text import array_function, fits, in_arrays, prod
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"
 
-_RESTS = ("rest", "calm")  # of the drift, in the exponential scheme: of a path, and of the one without noise
+# What the rest of the drift adds in this step and in the next, in the exponential scheme: of a path, and without noise
+_PUSHES = (("push", "later"), ("calm", "hence"))
+
+_WIDE = ("x", "y", "f", "a", "b", "h", "rest", "change", "lead", *_PUSHES[0], *_PUSHES[1])  # arrays of a kernel
 
 NJIT = '@njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)'
 """Of what ``run`` alone calls: wrappers for other callers cost a fifth of the time to compile."""
@@ -120,7 +123,7 @@ def open_noise(model: StepModel, p: Parameters) -> list[str]:
     """Lines that take up the stream of the noise, and make the arrays that a path needs."""
     lines = [f"noise = np.empty({model.noise_count})", f"{_WORDS} = {_STORED}"]
     if p.wide:
-        lines += [f"{state} = np.empty({model.dimension})" for state in ("x", "y", "f", "a", "b", "h", *_RESTS, "lead")]
+        lines += [f"{state} = np.empty({model.dimension})" for state in _WIDE]
         lines += [f"values = np.empty({values_count(model.drift)})"]
     return lines
 
@@ -183,7 +186,7 @@ def _exponential_lines(model: StepModel, p: Parameters, first: str) -> tuple[lis
     switched = _disturbance(model, p, "x")
     drift = [_drift_call(model, "x", "f", p)], [*_later(model, p), _drift_call(model, "lead", "f", p, model.step)]
     begins = pair_begins(model, first)
-    return [*switched, *drawn, *move_lines(model, ("x", "y", _RESTS[0]), drift, begins, p, noise)], bridge
+    return [*switched, *drawn, *move_lines(model, ("x", "y", *_PUSHES[0]), drift, begins, p, noise)], bridge
 
 
 def _later(model: StepModel, p: Parameters) -> list[str]:
@@ -211,7 +214,7 @@ def nominal_lines(model: StepModel, p: Parameters, first: str = "") -> list[str]
     """Lines that advance the noise-free path from a_i to b_i."""
     if model.exponential is not None:
         drift = [_drift_call(model, "a", "f", p)], [_drift_call(model, "lead", "f", p, model.step)]
-        return move_lines(model, ("a", "b", _RESTS[1]), drift, pair_begins(model, first), p)
+        return move_lines(model, ("a", "b", *_PUSHES[1]), drift, pair_begins(model, first), p)
     call = _drift_call(model, "a", "h", p)
     if p.wide:
         return [call, *_wide_move(model, "a", "h", "b", p)]

@@ -56,13 +56,17 @@ class Scenario:
 class Exponential:
     """Matrices (n, n) of the exponential midpoint rule, over one step h; see ``stiffness``.
 
-    Pairs of steps share one rest of the drift, N(x) = f(x) - base x, taken where the first of them ends.
+    Pairs of steps share one rest of the drift, N(x) = f(x) - base x, taken where the first of them ends, and where the
+    pair begins.
     """
 
     base: Array  # J, 1/s
     move: Array  # e^{h J}
     response: Array  # int_0^h e^{s J} ds: what the rest of the drift adds in a step
     lead: Array  # what it adds to the state where it is taken anew
+    # what its change since the pair began adds in the first and the second step; of modes that die out within a step
+    first: Array
+    second: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

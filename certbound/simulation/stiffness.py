@@ -6,16 +6,18 @@ h = 1 ms.
 
 The exponential midpoint rule splits the drift into J x and a rest N. In a pair of steps of length h,
 
-    c = E x + A N(x) + w_1,   y = E x + P N(c) + w_1,   z = E y + P N(c) + w_2,   E = e^{h J},  P = int_0^h e^{s J} ds,
+    c = E x + A N(x) + w_1,   y = E x + P N(c) - B D + w_1,   z = E y + P N(c) + C D + w_2,   D = N(c) - N(x),
 
-with w_1, w_2 ~ N(0, int_0^h e^{s J} g g' e^{s J'} ds): exact where N is constant, of weak order 2 where g is (Hochbruck
-and Ostermann, Exponential integrators, 2010). A is P on modes that die out within a step, so that c stays on slow
-manifolds, and h elsewhere: where N is a force, a function of positions that acts on velocities, N(c) is then N(E x +
-w_1), the rule is symmetric in time, and adds no damping and no energy to a swing, however light.
+E = e^{h J}, P = int_0^h e^{s J} ds and w_1, w_2 ~ N(0, int_0^h e^{s J} g g' e^{s J'} ds): exact where N is constant, of
+weak order 2 where g is (Hochbruck and Ostermann, Exponential integrators, 2010). On modes that die out within a step A
+is P, and B and C are those of an N that grows evenly, so that paths stay on slow manifolds. Elsewhere A is h, and B and
+C are 0: where N is a force, a function of positions that acts on velocities, N(c) is then N(E x + w_1), the rule is
+symmetric in time, and adds no damping and no energy to a swing, however light.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -37,10 +39,13 @@ _DEAD = 0.3  # a mode that falls by more within a step follows the others, and o
 _Matrices = Array  # (k, n, n)
 
 
-def jacobians(model: StepModel, steps: int, start: Any) -> _Matrices:
+def jacobians(
+    model: StepModel, steps: int, start: Any, stays: Callable[[Array, float], bool] = lambda state, time: True
+) -> _Matrices:
     """J along the noise-free path, and beside it by twice the deviation that linear noise has there; finite ones only.
 
-    ``start(rng, count)`` draws starts. The first is J at the first start.
+    ``start(rng, count)`` draws starts, and the path ends where ``stays(state, time)`` is false. The first is J at the
+    first start.
     """
     n, horizon = model.dimension, steps * model.interval
     rng = np.random.default_rng(0)
@@ -67,13 +72,21 @@ def jacobians(model: StepModel, steps: int, start: Any) -> _Matrices:
         if h * np.max(np.linalg.eigvals(first).real) > _FASTEST:
             return np.array(found[:1])
         noise = _diffusion(model, x[0])
-        move, _, factor = exact_transition(np.hstack([first, np.eye(n)]), np.zeros(n), noise, h)
-        point, cloud = x[0], np.zeros(n)
+        move, _, factor = exact_transition(first, np.zeros(n), noise, h)
+        point, cloud, scheme = x[0], np.zeros(n), exponential_step(first, 0.5 * h)
+
+        def rest(time: float, state: Array) -> Array:
+            values = state.tolist()
+            return np.array(drift(time, *values, *others(time, values)), dtype=float) - first @ state
+
         for k in range(_PIECES):
-            state = point.tolist()
-            point = point + move[:, n:] @ np.array(drift(k * h, *state, *others(k * h, state)), dtype=float)
-            cloud = move[:, :n] @ cloud + factor @ rng.standard_normal(factor.shape[1])
-            if not np.all(np.isfinite(point)):
+            lead = scheme.move @ point + scheme.lead @ rest(k * h, point)
+            begin, middle = rest(k * h, point), rest((k + 0.5) * h, lead)
+            change, taken = middle - begin, scheme.response @ middle
+            point = scheme.move @ (scheme.move @ point + taken - scheme.first @ change)
+            point = point + taken + scheme.second @ change
+            cloud = move @ cloud + factor @ rng.standard_normal(factor.shape[1])
+            if not (np.all(np.isfinite(point)) and stays(point, (k + 1) * h)):
                 break
             if (k + 1) % (_PIECES // _LOOKS) == 0:
                 found += [at((k + 1) * h, point), at((k + 1) * h, point + 2.0 * cloud)]
@@ -118,7 +131,15 @@ def _pair(scheme: Exponential, matrix: Array) -> Array:
     """The matrix of a pair of steps of the exponential scheme where the drift is ``matrix`` x."""
     rest = matrix - scheme.base
     taken = rest @ (scheme.move + scheme.lead @ rest)
-    return scheme.move @ (scheme.move + scheme.response @ taken) + scheme.response @ taken
+    middle = scheme.move + scheme.response @ taken - scheme.first @ (taken - rest)
+    return scheme.move @ middle + scheme.response @ taken + scheme.second @ (taken - rest)
+
+
+def linear_part(matrices: _Matrices, step: float, horizon: float) -> Array:
+    """The J of the exponential scheme: the first, or the mean of all where the error is half as large with it."""
+    first, mean = matrices[0], np.mean(matrices, axis=0)
+    errors = [step_error(matrices, step, horizon, base) for base in (first, mean)]
+    return mean if 2.0 * errors[1] < errors[0] else first
 
 
 def steps_needed(matrices: _Matrices, steps: int, horizon: float, base: Array | None = None) -> int:
@@ -132,12 +153,12 @@ def steps_needed(matrices: _Matrices, steps: int, horizon: float, base: Array | 
 
 def exponential_step(base: Array, step: float) -> Exponential:
     """The matrices of the exponential midpoint rule that is exact where the drift is linear with Jacobian ``base``."""
+    identity = np.eye(len(base))
     with np.errstate(all="ignore"):
-        move, response = _propagator(base, step)
-        lead = step * np.eye(len(base))
-        if np.all(np.isfinite(response)):
-            lead += (response - lead) @ _fast_modes(base, step)
-    return Exponential(base=base, move=move, response=response, lead=lead)
+        move, response, growing = _propagator(base, step)
+        fast = _fast_modes(base, step) if np.all(np.isfinite(growing)) else identity
+        lead, first = step * identity + (response - step * identity) @ fast, (response - growing) @ fast
+        return Exponential(base=base, move=move, response=response, lead=lead, first=first, second=growing @ fast)
 
 
 def exponential(model: StepModel, base: Array) -> StepModel:
@@ -169,15 +190,15 @@ def _fast_modes(base: Array, step: float) -> Array:
     return np.asarray((turn @ inner @ turn.conj().T).real)
 
 
-def _propagator(base: Array, step: float) -> tuple[Array, Array]:
-    """e^{h J} and int_0^h e^{s J} ds."""
+def _propagator(base: Array, step: float) -> tuple[Array, Array, Array]:
+    """e^{h J}, int_0^h e^{s J} ds and int_0^h e^{(h - s) J} s/h ds."""
     from scipy.linalg import expm
 
     n = len(base)
-    block = np.zeros((2 * n, 2 * n))
-    block[:n, :n], block[:n, n:] = base, np.eye(n)
-    whole = np.asarray(expm(block * step))
-    return whole[:n, :n], whole[:n, n:]
+    block = np.zeros((3 * n, 3 * n))
+    block[:n, :n], block[:n, n : 2 * n], block[n : 2 * n, 2 * n :] = base * step, np.eye(n) * step, np.eye(n)
+    whole = np.asarray(expm(block))
+    return whole[:n, :n], whole[:n, n : 2 * n], whole[:n, 2 * n :]
 
 
 def _diffusion(model: StepModel, x: Array) -> Array:

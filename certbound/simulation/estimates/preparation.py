@@ -18,7 +18,7 @@ from certbound.problem.model import Tape, compile_scalar
 from certbound.problem.problem import Problem
 from certbound.simulation.blocks import MEMORY_LIMIT, Work, check_count
 from certbound.simulation.stepping import Scenario, StepModel, step_model
-from certbound.simulation.stiffness import exponential, jacobians, step_error, steps_needed
+from certbound.simulation.stiffness import exponential, jacobians, linear_part, step_error, steps_needed
 
 Starts = Callable[[np.random.Generator, int], Array]
 """``start(rng, count)`` draws starts."""
@@ -64,7 +64,7 @@ class Setting:
         drift = compile_scalar(model.drift)
         path = [self.fixed]
         inputs = model.table.tolist() if model.table.size else [()] * self.steps
-        rest = np.zeros(len(self.fixed))
+        push = later = np.zeros(len(self.fixed))
 
         def force(k: int, time: float, state: Array) -> Array:
             return np.array(drift(time, *state.tolist(), *inputs[k]), dtype=float)
@@ -78,9 +78,14 @@ class Setting:
                     continue
                 new = scheme.move @ state
                 if (k % model.constant if model.constant else k) % 2 == 0:
-                    lead = new + scheme.lead @ (force(k, time, state) - scheme.base @ state)
+                    begin = force(k, time, state) - scheme.base @ state
+                    lead = new + scheme.lead @ begin
                     rest = force(k, time + model.step, lead) - scheme.base @ lead
-                path.append(new + scheme.response @ rest)
+                    push = scheme.response @ rest - scheme.first @ (rest - begin)
+                    later = scheme.response @ rest + scheme.second @ (rest - begin)
+                else:
+                    push = later
+                path.append(new + push)
         return np.array(path, dtype=float)
 
     def work(self, kernel: tuple[str, Array], kind: type[Work] = Work, **fields: Any) -> Work:
@@ -147,13 +152,14 @@ def _fine_enough(
     finer than those change the scheme no more.
     """
     horizon = float(problem.horizon)
-    looks = jacobians(model, steps, start)
+    looks = jacobians(model, steps, start, lambda state, time: _stays(problem, state, time))
     if not len(looks):  # undefined at the starts
         return model, steps
     coarse = horizon / min(steps, _DEFAULT_STEPS)
     base, rough = None, step_error(looks, coarse, horizon)
-    if scenario.scheme == "auto" and rough > max(_ROUGH, step_error(looks, coarse, horizon, looks[0])):
-        base = looks[0]
+    if scenario.scheme == "auto" and rough > _ROUGH:
+        base = linear_part(looks, coarse, horizon)
+        base = base if rough > step_error(looks, coarse, horizon, base) else None
     needed = steps_needed(looks, steps, horizon, base)
     if base is not None and isinstance(model.noise, Tape):
         needed = max(needed, _noise_steps(base, steps, horizon))
@@ -167,6 +173,12 @@ def _fine_enough(
             stacklevel=4,
         )
     return (model if base is None else exponential(model, base)), steps
+
+
+def _stays(problem: Any, state: Array, time: float) -> bool:
+    """Whether a state keeps the constraints that hold all the time."""
+    held = [constraint for constraint in problem.kept if constraint.during is None]
+    return all(bool(constraint.satisfied(state[None], time)[0]) for constraint in held)
 
 
 def _noise_steps(base: Array, steps: int, horizon: float) -> int:

@@ -7,7 +7,8 @@ import pytest
 from certbound.cli.app import run
 
 KEYS = {
-    "paths", "exits", "probability", "lower", "upper", "confidence", "path_steps_per_second", "seconds",
+    "paths", "exits", "probability", "lower", "upper", "confidence", "path_steps_per_second", "seconds", "step",
+    "refuted",
 }  # fmt: skip
 
 
