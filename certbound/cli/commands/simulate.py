@@ -39,7 +39,6 @@ from certbound.watch import OutOfTime
 
 if TYPE_CHECKING:
     from certbound.problem.problem import Problem
-    from certbound.simulation.estimates.halving import StepEffect
     from certbound.simulation.executors import Progress
 
 EXAMPLES = examples(
@@ -154,7 +153,7 @@ def _rare(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
     return attributes(found, *COUNTED, "standard_error", "replicas", *SPENT) | _step(found.step)
 
 
-def _step(effect: StepEffect | None) -> dict[str, Any]:
+def _step(effect: Any) -> dict[str, Any]:
     """What the step adds, with its limits, and the paths that say so; null in discrete time."""
     return {"step": None if effect is None else attributes(effect, "adds", "lower", "upper", "paths")}
 
