@@ -90,8 +90,8 @@ class Bridge:
         """Whether ``matrix . x`` gets no noise of its own."""
         if self.spread is not None:
             return not np.any(matrix @ self.spread)
-        rows = np.flatnonzero(np.any(matrix != 0.0, axis=0))
-        return all(entry == "0.0" for i in rows for entry in self.entries[i])
+        rows = np.any(matrix != 0.0, axis=0).tolist()
+        return all(entry == "0.0" for row, moves in zip(self.entries, rows, strict=True) if moves for entry in row)
 
     @staticmethod
     def squares(terms: Sequence[str]) -> str:
@@ -236,8 +236,8 @@ def _faces(
     if looped:
         made = [f"{names[0]}, {names[1]} = np.empty({rows}), np.empty({rows})", *gaps(old, "x", "0")]
         made += [if_all(starts_at_once(number, barrier), f"{names[0]}.min() < 0.0"), f"    left = {number}"]
-        more, step, end = _many_faces(number, barrier, bridge, gaps(new, "y", "k + 1"), p)
-        return made + more, step, end
+        begin, *others = _many_faces(number, barrier, bridge, gaps(new, "y", "k + 1"), p)
+        return made + begin, others[0], others[1]
     start = [*gaps(old, "x", "0"), if_all(starts_at_once(number, barrier), f"({out(old)})"), f"    left = {number}"]
     step = [
         *gaps(new, "y", "k + 1"),

@@ -81,8 +81,8 @@ def jacobians(
 
         for k in range(_PIECES):
             lead = scheme.move @ point + scheme.lead @ rest(k * h, point)
-            begin, middle = rest(k * h, point), rest((k + 0.5) * h, lead)
-            change, taken = middle - begin, scheme.response @ middle
+            renewed = rest((k + 0.5) * h, lead)
+            change, taken = renewed - rest(k * h, point), scheme.response @ renewed
             point = scheme.move @ (scheme.move @ point + taken - scheme.first @ change)
             point = point + taken + scheme.second @ change
             cloud = move @ cloud + factor @ rng.standard_normal(factor.shape[1])
@@ -137,7 +137,8 @@ def _pair(scheme: Exponential, matrix: Array) -> Array:
 
 def linear_part(matrices: _Matrices, step: float, horizon: float) -> Array:
     """The J of the exponential scheme: the first, or the mean of all where the error is half as large with it."""
-    first, mean = matrices[0], np.mean(matrices, axis=0)
+    first: Array = matrices[0]
+    mean = np.asarray(np.mean(matrices, axis=0))
     errors = [step_error(matrices, step, horizon, base) for base in (first, mean)]
     return mean if 2.0 * errors[1] < errors[0] else first
 
@@ -179,9 +180,10 @@ def _fast_modes(base: Array, step: float) -> Array:
     from scipy.linalg import schur, solve_sylvester
 
     n = len(base)
-    form, turn, count = schur(base, output="complex", sort=lambda rate: rate.real * step < -1.0)
+    sorted_schur: Any = schur
+    form, turn, count = sorted_schur(base, output="complex", sort=lambda rate: rate.real * step < -1.0)
     if count in (0, n):
-        return np.eye(n) * (count > 0)
+        return np.asarray(np.eye(n) * (count > 0))
     coupling = solve_sylvester(form[:count, :count], -form[count:, count:], -form[:count, count:])
     if not np.linalg.norm(coupling) < _OBLIQUE:
         return np.eye(n)

@@ -11,7 +11,7 @@ from certbound.simulation.estimates.montecarlo import simulate_exits
 from certbound.simulation.estimates.paths import sample_paths
 from certbound.simulation.estimates.preparation import prepare
 from certbound.simulation.stepping import Scenario
-from certbound.simulation.stiffness import step_error, steps_needed
+from certbound.simulation.stiffness import jacobians, step_error, steps_needed
 from certbound.simulation.transition import bridge_shares
 
 SWING = np.array([[0.0, 1.0], [-38_900.0, -20.0]])
@@ -94,7 +94,7 @@ def light(spring, damping=0.02, limit=0.5, horizon=60.0, noise=0.03):
 
 def test_a_light_swing_keeps_its_energy_however_coarse_the_step():
     """Without damping and noise the exponential Euler scheme damps a soft spring, and Euler's drives it."""
-    problem = light(lambda x: x - x**3, damping=0.0, noise=0.0)
+    problem = light(lambda x: x - x**3, damping=0.0, limit=0.9, noise=0.0)
     for steps in (200, 600, 2000):
         path = sample_paths(problem, paths=1, steps=steps, scenario=Scenario(initial=[0.6, 0.0]))[0]
         energy = 0.5 * path[:, 1] ** 2 + 0.5 * path[:, 0] ** 2 - 0.25 * path[:, 0] ** 4
@@ -135,3 +135,20 @@ def test_where_the_drift_is_undefined_at_the_start_nothing_is_said_of_steps():
 
 def test_a_step_so_long_that_the_scheme_has_no_numbers_is_too_long():
     assert step_error(SWING[None] * -1.0, 1e300, 1e300, -SWING) == np.inf
+
+
+def test_disturbances_act_along_the_path_that_is_looked_at():
+    """Pushed by .05 to .15, x' = -x^3 + d settles at .46, where J is -.65; without it at 0, where J is 0."""
+    system = cb.ContinuousSystem(
+        lambda x, d: [-(x[0] ** 3) + d[0]], states=1, disturbance=cb.Box([0.05], [0.15]), diffusion=[[0.1]]
+    )
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-9.0], [9.0]))], horizon=20.0, delta=0.1)
+    setting = prepare(problem, 2000)
+    looks = jacobians(setting.model, setting.steps, setting.start)
+    assert looks[-2, 0, 0] == pytest.approx(-3.0 * 0.1 ** (2 / 3), rel=0.05)
+
+
+def test_the_path_that_is_looked_at_ends_where_it_leaves():
+    problem = light(lambda x: x - 2.0 * x**3, limit=0.9)
+    setting = prepare(problem.replace(initial=[0.85, 0.3]))
+    assert (setting.model.scheme, setting.steps) == ("exponential", 1000)

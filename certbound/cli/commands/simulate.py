@@ -47,7 +47,7 @@ EXAMPLES = examples(
     "certbound simulate chain --paths 1e7 --checkpoint run.npz --against chain.json",
     "certbound simulate ou --paths 1e4 --rare",
 )
-FIRST = 2000
+FIRST = 500
 COUNTED = ("paths", "exits", "probability", "lower", "upper", "confidence", "refuted")
 SPENT = ("steps", "scheme", "path_steps_per_second", "seconds")
 

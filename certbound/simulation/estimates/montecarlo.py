@@ -210,10 +210,11 @@ def _work(problem: Any, setting: Setting, model: StepModel, kind: type[Work] = W
 def _paired(problem: Any, setting: Setting, scenario: Scenario | None, work: Work, ignored: int) -> PairedWork:
     """The work that counts exits with the step, and with half of it, of the same paths; none of those of ``work``."""
     fine = halved(problem, setting, scenario)
-    rows, both = work.counts_shape[0], {"paths": paired_paths(work.paths), "entropy": work.entropy ^ OTHER}
+    rows = work.counts_shape[0]
+    both: dict[str, Any] = {"paths": paired_paths(work.paths), "entropy": work.entropy ^ OTHER}
     coarse = _work(problem, setting, composed(setting.model, fine.model), counts_shape=(rows, 2), **both)
-    fields = {"coarse": coarse, "rows": rows, "ignored": ignored, "counts_shape": (1, 3)}
-    return cast(PairedWork, _work(problem, fine, fine.model, PairedWork, **fields, **both))
+    both |= {"coarse": coarse, "rows": rows, "ignored": ignored, "counts_shape": (1, 3)}
+    return cast(PairedWork, _work(problem, fine, fine.model, PairedWork, **both))
 
 
 def _bin_ends(setting: Setting, bins: int) -> Array:

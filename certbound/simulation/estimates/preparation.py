@@ -187,7 +187,7 @@ def _noise_steps(base: Array, steps: int, horizon: float) -> int:
     A mode of rate -a has a variance of (a h)/sinh(a h) of the right one then: .85 at a h = 1.
     """
     fastest = max(float(-np.linalg.eigvals(base).real.min()), 0.0) * horizon
-    return steps * 2 ** max(math.ceil(math.log2(max(fastest / steps, 1.0))), 0)
+    return steps << max(math.ceil(math.log2(max(fastest / steps, 1.0))), 0)
 
 
 def refuse_held(problem: Any, what: str) -> None:

@@ -95,10 +95,12 @@ def simulate_rare_exits(
         Particles in all; ``paths // particles`` independent replicas run, at least ten.
     particles : int
         Particles per replica, at least 20.
+    rng, steps, confidence
+        As in `certbound.simulate_exits`.
     halve : bool
         Run half as many replicas of half as many particles with half of the step too, on noise of their own: copies of
         particles cannot share it. Not in discrete time.
-    rng, steps, confidence, executor, checkpoint, progress, scenario
+    executor, checkpoint, progress, scenario
         As in `certbound.simulate_exits`; a switching disturbance is refused.
 
     Returns
