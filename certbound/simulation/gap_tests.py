@@ -61,6 +61,7 @@ class Bridge:
 
     spread: Array | None
     entries: Sequence[Sequence[str]] = ()
+    rough: Array | None = None  # as ``spread``, of states too that follow noise at once; ``spread`` where omitted
 
     def variance(self, row: Sequence[float], parameters: Parameters) -> str:
         """Expression of |row . G|^2 h for a fixed row."""
@@ -87,9 +88,9 @@ class Bridge:
         return float(square[0, 0]) if even else 0.0
 
     def smooth(self, matrix: Array) -> bool:
-        """Whether ``matrix . x`` gets no noise of its own."""
+        """Whether ``matrix . x`` gets no noise of its own, and follows none within a step."""
         if self.spread is not None:
-            return not np.any(matrix @ self.spread)
+            return not np.any(matrix @ (self.spread if self.rough is None else self.rough))
         rows = np.any(matrix != 0.0, axis=0).tolist()
         return all(entry == "0.0" for row, moves in zip(self.entries, rows, strict=True) if moves for entry in row)
 

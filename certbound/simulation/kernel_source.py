@@ -28,10 +28,10 @@ from certbound.simulation.wide_text import array_function, fits, in_arrays, prod
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"
 
-# What the rest of the drift adds in this step and in the next, in the exponential scheme: of a path, and without noise
-_PUSHES = (("push", "later"), ("calm", "hence"))
+# The rest of the drift, and what it adds in a step, in the exponential scheme: of a path, and without noise
+_PUSHES = (("rest", "push"), ("calm", "hence"))
 
-_WIDE = ("x", "y", "f", "a", "b", "h", "rest", "change", "lead", *_PUSHES[0], *_PUSHES[1])  # arrays of a kernel
+_WIDE = ("x", "y", "f", "a", "b", "h", "change", "copy", "lead", *_PUSHES[0], *_PUSHES[1])  # arrays of a kernel
 
 NJIT = '@njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)'
 """Of what ``run`` alone calls: wrappers for other callers cost a fifth of the time to compile."""
@@ -250,7 +250,7 @@ def _wide_draws(model: StepModel) -> list[str]:
 
 
 def _bridge(model: StepModel) -> Bridge | None:
-    return Bridge(spread=model.spread) if model.bridge and model.spread is not None else None
+    return Bridge(spread=model.spread, rough=model.rough) if model.bridge and model.spread is not None else None
 
 
 def _arguments(model: StepModel, state: str) -> list[str]:

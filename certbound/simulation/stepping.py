@@ -14,7 +14,7 @@ from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, j
 from certbound.problem.noise import Law, check_law
 from certbound.problem.random_constants import Random
 from certbound.simulation.tape_text import live_nodes
-from certbound.simulation.transition import bridge_shares, exact_transition
+from certbound.simulation.transition import bridge_spread, exact_transition
 
 _LARGEST_EXACT = 16
 
@@ -56,15 +56,15 @@ class Scenario:
 class Exponential:
     """Matrices (n, n) of the exponential midpoint rule, over one step h; see ``stiffness``.
 
-    Pairs of steps share one rest of the drift, N(x) = f(x) - base x, taken where the first of them ends, and where the
-    pair begins.
+    Pairs of steps share one rest of the drift, N(x) = f(x) - base x, taken where the first of them ends; on
+    modes that die out within a step it is taken where each ends.
     """
 
     base: Array  # J, 1/s
     move: Array  # e^{h J}
     response: Array  # int_0^h e^{s J} ds: what the rest of the drift adds in a step
     lead: Array  # what it adds to the state where it is taken anew
-    # what its change since the pair began adds in the first and the second step; of modes that die out within a step
+    # what its change in the first step takes off, and that in the second adds; of modes that die out within a step
     first: Array
     second: Array
 
@@ -92,6 +92,7 @@ class StepModel:
     correction: Tape | None = None  # diagonal of d g_ii/d x_i, for Milstein's scheme
     # (n, m): g sqrt(h) of the bridge between two steps; None in discrete time, and where ``noise`` is a tape
     spread: Array | None = None
+    rough: Array | None = None  # (n, k): where rows are 0 states are smooth on a step; None: where those of spread are
     bridge: bool = False  # whether exits between steps are looked for
     signal: Tape | None = None  # disturbance as a function of (t, states)
     # (disturbance_count,): the disturbance's box
@@ -246,7 +247,7 @@ def _continuous(
     if linear is not None and (n <= _LARGEST_EXACT or wanted == "exact"):
         transition, offset, factor = exact_transition(*linear, np.asarray(diffusion), step)
         drift = _affine_tape(tape.inputs, np.hstack([np.zeros((n, 1)), transition]), offset)
-        spread *= bridge_shares(linear[0][:, :n], np.asarray(diffusion), step)[:, None]
+        spread = bridge_spread(linear[0][:, :n], np.asarray(diffusion), step)
         return StepModel(drift=drift, noise=factor, spread=spread, carry=transition[:, :n], scheme="exact", **fields)
     if wanted in ("exact", "milstein"):
         need = "a linear system with constant coefficients" if wanted == "exact" else "a state-dependent diffusion"

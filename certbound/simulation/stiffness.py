@@ -6,11 +6,12 @@ h = 1 ms.
 
 The exponential midpoint rule splits the drift into J x and a rest N. In a pair of steps of length h,
 
-    c = E x + A N(x) + w_1,   y = E x + P N(c) - B D + w_1,   z = E y + P N(c) + C D + w_2,   D = N(c) - N(x),
+    c = E x + A N(x) + w_1,      y = E x + P N(c) - B (N(c) - N(x)) + w_1,
+    d = E y + P N(c) + w_2,      z = d + C (N(d) - N(c)),
 
 E = e^{h J}, P = int_0^h e^{s J} ds and w_1, w_2 ~ N(0, int_0^h e^{s J} g g' e^{s J'} ds): exact where N is constant, of
 weak order 2 where g is (Hochbruck and Ostermann, Exponential integrators, 2010). On modes that die out within a step A
-is P, and B and C are those of an N that grows evenly, so that paths stay on slow manifolds. Elsewhere A is h, and B and
+is P, and B and C are those of an N that grows evenly, so that paths end on slow manifolds. Elsewhere A is h, and B and
 C are 0: where N is a force, a function of positions that acts on velocities, N(c) is then N(E x + w_1), the rule is
 symmetric in time, and adds no damping and no energy to a swing, however light.
 """
@@ -26,7 +27,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.problem.model import Tape, compile_numpy, compile_scalar, jacobian
 from certbound.simulation.stepping import Exponential, StepModel
-from certbound.simulation.transition import bridge_shares, exact_transition
+from certbound.simulation.transition import bridge_spread, exact_transition
 
 _TOLERANCE = 0.2
 _PIECES = 40  # of the noise-free path on which Jacobians are looked at
@@ -82,9 +83,10 @@ def jacobians(
         for k in range(_PIECES):
             lead = scheme.move @ point + scheme.lead @ rest(k * h, point)
             renewed = rest((k + 0.5) * h, lead)
-            change, taken = renewed - rest(k * h, point), scheme.response @ renewed
-            point = scheme.move @ (scheme.move @ point + taken - scheme.first @ change)
-            point = point + taken + scheme.second @ change
+            taken = scheme.response @ renewed
+            point = scheme.move @ point + taken - scheme.first @ (renewed - rest(k * h, point))
+            point = scheme.move @ point + taken
+            point = point + scheme.second @ (rest((k + 1) * h, point) - renewed)
             cloud = move @ cloud + factor @ rng.standard_normal(factor.shape[1])
             if not (np.all(np.isfinite(point)) and stays(point, (k + 1) * h)):
                 break
@@ -132,7 +134,8 @@ def _pair(scheme: Exponential, matrix: Array) -> Array:
     rest = matrix - scheme.base
     taken = rest @ (scheme.move + scheme.lead @ rest)
     middle = scheme.move + scheme.response @ taken - scheme.first @ (taken - rest)
-    return scheme.move @ middle + scheme.response @ taken + scheme.second @ (taken - rest)
+    end = scheme.move @ middle + scheme.response @ taken
+    return end + scheme.second @ (rest @ end - taken)
 
 
 def linear_part(matrices: _Matrices, step: float, horizon: float) -> Array:
@@ -169,9 +172,10 @@ def exponential(model: StepModel, base: Array) -> StepModel:
         return replace(model, exponential=scheme, scheme="exponential")
     diffusion = model.noise / np.sqrt(model.step)
     _, _, factor = exact_transition(base, np.zeros(model.dimension), diffusion, model.step)
-    spread = bridge_shares(base, diffusion, model.step)[:, None] * model.noise
+    rough = bridge_spread(base, diffusion, model.step)
+    spread = rough * np.any(diffusion != 0.0, axis=1)[:, None]  # what follows noise does so by another slope elsewhere
     return replace(
-        model, exponential=scheme, noise=factor, spread=spread, carry=scheme.move, scheme="exponential"
+        model, exponential=scheme, noise=factor, spread=spread, rough=rough, carry=scheme.move, scheme="exponential"
     )
 
 

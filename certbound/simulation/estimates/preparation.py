@@ -64,7 +64,7 @@ class Setting:
         drift = compile_scalar(model.drift)
         path = [self.fixed]
         inputs = model.table.tolist() if model.table.size else [()] * self.steps
-        push = later = np.zeros(len(self.fixed))
+        rest = np.zeros(len(self.fixed))
 
         def force(k: int, time: float, state: Array) -> Array:
             return np.array(drift(time, *state.tolist(), *inputs[k]), dtype=float)
@@ -81,11 +81,13 @@ class Setting:
                     begin = force(k, time, state) - scheme.base @ state
                     lead = new + scheme.lead @ begin
                     rest = force(k, time + model.step, lead) - scheme.base @ lead
-                    push = scheme.response @ rest - scheme.first @ (rest - begin)
-                    later = scheme.response @ rest + scheme.second @ (rest - begin)
-                else:
-                    push = later
-                path.append(new + push)
+                    path.append(new + scheme.response @ rest - scheme.first @ (rest - begin))
+                    continue
+                new = new + scheme.response @ rest
+                if np.any(scheme.second):
+                    change = force(k, time + model.step, new) - scheme.base @ new - rest
+                    new = new + scheme.second @ change
+                path.append(new)
         return np.array(path, dtype=float)
 
     def work(self, kernel: tuple[str, Array], kind: type[Work] = Work, **fields: Any) -> Work:
