@@ -7,6 +7,7 @@ variates, of bridges, are not shared."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,11 @@ class StepEffect:
     upper: float
     halved_lower: float  # lower limit of the probability with half of the step
     paths: int  # simulated with both
+
+
+def checkpoint_beside(checkpoint: str | Path | None) -> Path | None:
+    """The file that keeps what half of the step counts, beside that of a run."""
+    return None if checkpoint is None else Path(f"{checkpoint}.halved")
 
 
 def paired_paths(paths: int) -> int:
@@ -77,6 +83,10 @@ class PairedWork(Work):
         """Compile both kernels."""
         super().compile()
         self.coarse.compile()
+
+    def digest(self) -> str:
+        """Hash of all that the answer depends on, of both works."""
+        return f"{super().digest()} {self.coarse.digest()} {self.ignored}"
 
     def run_block(self, block: int, tally: Tally, out: Array | None = None) -> int:
         count = min(self.block, self.paths - block * self.block)

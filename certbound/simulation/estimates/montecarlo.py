@@ -17,6 +17,7 @@ from certbound.simulation.estimates.halving import (
     OTHER,
     PairedWork,
     StepEffect,
+    checkpoint_beside,
     composed,
     halved,
     paired_paths,
@@ -128,7 +129,8 @@ def simulate_exits(
     executor : concurrent.futures.Executor or dask Client, optional
         Threads of this process when omitted.
     checkpoint : path, optional
-        File that keeps finished chunks. An existing one is continued, with its seed where ``rng`` is omitted.
+        File that keeps finished chunks, and beside it one named with ``.halved`` those with half of the step. An
+        existing one is continued, with its seed where ``rng`` is omitted.
     progress : callable, optional
         Called now and then with a `Progress`.
     scenario : Scenario, optional
@@ -174,7 +176,7 @@ def simulate_exits(
     step, seconds = None, outcome.seconds
     if halve and setting.model.scheme != "discrete":
         paired = _paired(problem, setting, scenario, work, len(barriers) - 1 if ends else -1)
-        pairs = run_work(paired, executor)
+        pairs = run_work(paired, executor, checkpoint_beside(checkpoint))
         step = step_effect(pairs.tally.counts[0], (exits, paths), paired.paths, confidence)
         seconds += pairs.seconds
     by_constraint: dict[str, int] = {}

@@ -20,7 +20,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count
 from certbound.simulation.checkpoint import seed_of
-from certbound.simulation.estimates.halving import OTHER, StepEffect, halved
+from certbound.simulation.estimates.halving import OTHER, StepEffect, checkpoint_beside, halved
 from certbound.simulation.estimates.preparation import Setting, prepare, refuse_held
 from certbound.simulation.estimates.score import score_source
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
@@ -141,7 +141,8 @@ def simulate_rare_exits(
     step, seconds = None, outcome.seconds
     if halve and model.scheme != "discrete":
         fine, few = halved(problem, setting, scenario), max(particles // 2, 10)
-        other = run_work(_rare_work(problem, fine, few, max(replicas // 2, 10), work.entropy ^ OTHER), executor)
+        half = _rare_work(problem, fine, few, max(replicas // 2, 10), work.entropy ^ OTHER)
+        other = run_work(half, executor, checkpoint_beside(checkpoint))
         step = _step_effect(_estimates(outcome.tally), _estimates(other.tally), few, confidence)
         seconds += other.seconds
     return RareExits(
