@@ -62,7 +62,7 @@ def decide(
         raise TypeError(f"`method` must be the name of one, got {method!r}; leave it out for the best of all engines.")
     plain = "auto" if method in ENGINES else method
     request = Request(method=plain, cells=cells, constants=constants, thorough=method != "auto")
-    names = engines_of(method)
+    names = _asked_of(problem, engines_of(method))
     watch = watch or current_watch() or Watch()
     for start in problem.starts:
         check_request(problem.replace(initial=start) if len(problem.starts) > 1 else problem, request)
@@ -86,6 +86,12 @@ def decide(
     except OutOfTime:
         _log.info("the search ended with its time")
     return search.verdict(names)
+
+
+def _asked_of(problem: Problem, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The engines without those that serve random starts alone, where the start is not random."""
+    random = any(start.random for start in problem.starts)
+    return names if random or len(names) == 1 else tuple(name for name in names if not ENGINES[name].drawn)
 
 
 class _Search:

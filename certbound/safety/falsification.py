@@ -40,11 +40,14 @@ class Violation:
 def find_violation(problem: Problem) -> Violation | None:
     """A noise-free trajectory from the initial set that provably breaks a constraint; None if none was found.
 
-    Leaving the model's domain is not counted: there the model says nothing.
+    Leaving the model's domain is not counted: there the model says nothing. Nor is the path of a random start's mean:
+    no path need be near it.
 
     Proves: the trajectory from ``start`` under one constant disturbance lies in ``reach``, and every point of
     ``reach`` at ``time`` breaks ``constraint``.
     """
+    if problem.initial.spread:
+        return None
     flow = Flow(problem)
     rng = np.random.default_rng(0)
     starts, signals = candidates(problem, flow, rng)

@@ -92,7 +92,10 @@ def find_miss(problem: Problem) -> Violation | None:
 
     Proves: the trajectory from ``start`` under one constant disturbance lies in ``reach``, which does not meet the
     target within its window, or not until ``time``, when a constraint is broken.
+    None of a random start, whose mean says nothing of what is drawn.
     """
+    if problem.initial.spread:
+        return None
     times, starts, signals, paths, flow = _followed(problem)
     first, last = window_of(problem)
     inside = rooms(Inside(problem.reach.region, (first, last)), flow, times, paths)

@@ -36,6 +36,7 @@ from certbound.safety.engines import (
     linear_chance,
     linear_engine,
     quadratic_engine,
+    starts_engine,
     values_engine,
 )
 from certbound.tubes.constants import Constants
@@ -89,6 +90,8 @@ class Engine:
         since it takes little, and a problem that fails often is UNSAFE then at once.
     endless : bool
         Whether it takes infinite horizons without a target.
+    drawn : bool
+        Whether it serves random starts alone: it is asked of no others unless by name.
     reaches : bool
         Whether it takes targets itself; others are asked to meet the target at one time (`certbound.problem.goals`).
     """
@@ -111,6 +114,7 @@ class Engine:
     below: Callable[[Problem], EngineAnswer | None] | None = None
     reaches: bool = False
     endless: bool = False
+    drawn: bool = False
 
 
 def _polynomials(problem: Problem) -> float:
@@ -121,6 +125,15 @@ def _polynomials(problem: Problem) -> float:
 ENGINES: dict[str, Engine] = {
     row.name: row
     for row in (
+        Engine(
+            name="starts",
+            words="an average over cells of a random start: of whether all paths of a cell fail, where no noise follows"
+            " the start of a linear model; else of what the linear response proves of the cell",
+            when="where the start is random; says most where the start decides which paths fail; has lower bounds too",
+            prove=starts_engine,
+            refines=True,
+            drawn=True,
+        ),
         Engine(
             name="linear",
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",

@@ -5,6 +5,9 @@ Between two grid times a path of a continuous system may leave and return. Given
 at both ends, a Brownian bridge of variance v h touches 0 with probability exp(-2 g g'/(v h)): exact for a
 half-space and constant diffusion, first-order accurate for smooth boundaries (Gobet, 2000). For a set of the
 kind "outside a polytope" the least of its faces' probabilities is taken.
+
+A gap that gets no noise of its own, as that of a position, is smooth: a parabola through its values at three steps has
+its least value between them (an error of fourth order in the step), where an oscillation turns.
 """
 
 from __future__ import annotations
@@ -58,6 +61,7 @@ class Bridge:
 
     spread: Array | None
     entries: Sequence[Sequence[str]] = ()
+    rough: Array | None = None  # as ``spread``, of states too that follow noise at once; ``spread`` where omitted
 
     def variance(self, row: Sequence[float], parameters: Parameters) -> str:
         """Expression of |row . G|^2 h for a fixed row."""
@@ -82,6 +86,13 @@ class Bridge:
         square = image @ image.T
         even = np.allclose(square, square[0, 0] * np.eye(len(square)), rtol=1e-12, atol=1e-14 * square[0, 0])
         return float(square[0, 0]) if even else 0.0
+
+    def smooth(self, matrix: Array) -> bool:
+        """Whether ``matrix . x`` gets no noise of its own, and follows none within a step."""
+        if self.spread is not None:
+            return not np.any(matrix @ (self.spread if self.rough is None else self.rough))
+        rows = np.any(matrix != 0.0, axis=0).tolist()
+        return all(entry == "0.0" for row, moves in zip(self.entries, rows, strict=True) if moves for entry in row)
 
     @staticmethod
     def squares(terms: Sequence[str]) -> str:
@@ -227,20 +238,39 @@ def _faces(
     if looped:
         made = [f"{names[0]}, {names[1]} = np.empty({rows}), np.empty({rows})", *gaps(old, "x", "0")]
         made += [if_all(starts_at_once(number, barrier), f"{names[0]}.min() < 0.0"), f"    left = {number}"]
-        return made, *_many_faces(number, barrier, bridge, gaps(new, "y", "k + 1"), p)
+        begin, *others = _many_faces(number, barrier, bridge, gaps(new, "y", "k + 1"), p)
+        return made + begin, others[0], others[1]
     start = [*gaps(old, "x", "0"), if_all(starts_at_once(number, barrier), f"({out(old)})"), f"    left = {number}"]
     step = [
         *gaps(new, "y", "k + 1"),
         if_all(f"({out(new)})", *window_test(number, barrier, "k + 1")),
         f"    left = {number}",
     ]
+    if bridge is None:
+        return start, step, []
+    spreads = [bridge.variance(row.tolist(), p) for row in barrier.matrix]
+    active = window_test(number, barrier, "k")
+    step += (_bridge_stay if barrier.stay else _bridge_avoid)(number, active, old, new, spreads, p)
     end: list[str] = []
-    if bridge is not None:
-        end = [f"{g} = {n}" for g, n in zip(old, new)]
-        spreads = [bridge.variance(row.tolist(), p) for row in barrier.matrix]
-        active = window_test(number, barrier, "k")
-        step += (_bridge_stay if barrier.stay else _bridge_avoid)(number, active, old, new, spreads, p)
+    for f, (g, n) in enumerate(zip(old, new)):
+        if bridge.smooth(barrier.matrix[f : f + 1]) and (barrier.stay or rows == 1):
+            start += [f"o_{number}_{f} = math.nan"]
+            step += _turn(f"o_{number}_{f}", g, n, number, barrier)
+            end += [f"o_{number}_{f} = {g}"]
+        end += [f"{g} = {n}"]
     return start, step, end
+
+
+def turns(older: str, old: str, new: str) -> str:
+    """The condition that a gap is least between three steps; of a first step, whose older gap is nan, it is false."""
+    return f"{old} < {older} and {old} <= {new}"
+
+
+def _turn(older: str, old: str, new: str, number: int, barrier: Barrier) -> list[str]:
+    """Leave where the parabola through three gaps, least between them, ends below 0."""
+    below = f"8.0 * {old} * ({older} - {old} + {new} - {old}) < ({new} - {older}) ** 2"
+    active = window_test(number, barrier, "k - 1")
+    return [if_all("left < 0", turns(older, old, new), below, *active), f"    left = {number}"]
 
 
 def _gaps_in_loops(barrier: Barrier, gap: str, state: str, moving: str, p: Parameters) -> list[str]:
@@ -252,12 +282,12 @@ def _gaps_in_loops(barrier: Barrier, gap: str, state: str, moving: str, p: Param
 
 def _many_faces(
     number: int, barrier: Barrier, bridge: Bridge | None, gaps: list[str], p: Parameters
-) -> tuple[list[str], list[str]]:
-    """Lines within a step and at its end for a set of many faces, whose gaps stand in arrays."""
+) -> tuple[list[str], list[str], list[str]]:
+    """Further lines of `_faces` for a set of many faces, whose gaps stand in arrays."""
     g, n, spread, faces = f"g_{number}", f"n_{number}", f"v_{number}", len(barrier.matrix)
     step = [*gaps, if_all(f"{n}.min() < 0.0", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
     if bridge is None:
-        return step, []
+        return [], step, []
     rows = [row.tolist() for row in barrier.matrix]
     if bridge.spread is not None:
         first = p.extend(np.sum((barrier.matrix @ bridge.spread) ** 2, axis=1).tolist())
@@ -268,7 +298,12 @@ def _many_faces(
     looks = [f"for face in range({faces}):", *indent(_cross(f"{g}[face]", f"{n}[face]", f"{spread}[face]", number, []))]
     active = window_test(number, barrier, "k")
     step += [if_all(*active), *indent(looks)] if active else looks
-    return step, [f"{g}[:] = {n}"]
+    calm = [f for f in range(faces) if bridge.smooth(barrier.matrix[f : f + 1])]
+    older, end = f"o_{number}", list[str]()
+    for f in calm:
+        step += _turn(f"{older}_{f}", f"{g}[{f}]", f"{n}[{f}]", number, barrier)
+        end += [f"{older}_{f} = {g}[{f}]"]
+    return [f"{older}_{f} = math.nan" for f in calm], step, [*end, f"{g}[:] = {n}"]
 
 
 def _bridge_stay(
@@ -323,6 +358,12 @@ def _round(
     end = [f"{old} = {new}"]
     if bridge is None:
         return start, step, []
+    if bridge.smooth(barrier.matrix):
+        older, gap, after = f"o_{number}", f"g_{number}", f"n_{number}"
+        sign = "-" if barrier.stay else ""
+        step += [f"{gap}, {after} = {sign}({old} - {radius} * {radius}), {sign}({new} - {radius} * {radius})"]
+        step += _turn(older, gap, after, number, barrier)
+        return [*start, f"{older} = math.nan"], step, [f"{older} = {gap}", *end]
     near = _near(barrier, bridge, old, new, p)
     gap = f"{radius} - math.sqrt({{0}})" if barrier.stay else f"math.sqrt({{0}}) - {radius}"
     lines = [f"before, after = {gap.format(old)}, {gap.format(new)}"]

@@ -5,7 +5,8 @@ inside the loop; its memory does not grow with paths or steps.
 
 Continuous time: Euler-Maruyama, x + f h + g sqrt(h) z, with Milstein's term 1/2 g g' h (z^2 - 1) where g is
 diagonal and each entry depends on its own state alone (then the term is exact and costs no further variate), but 0
-where g is; linear systems step by their exact transition, which is a discrete model.
+where g is; linear systems step by their exact transition, which is a discrete model, and stiff or light ones by
+the exponential midpoint rule.
 """
 
 from __future__ import annotations
@@ -16,14 +17,21 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.problem.model import Tape, is_zero
+from certbound.simulation.exponential_text import move_lines, pair_begins
 from certbound.simulation.gap_tests import Bridge
 from certbound.simulation.stepping import StepModel
+from certbound.simulation.stiffness import exponential_step
 from certbound.simulation.tape_text import Parameters, each, function_source, indent, linear_form, vector
 from certbound.simulation.tasks import Task, task_source
 from certbound.simulation.wide_text import array_function, fits, in_arrays, product, values_count
 
 _WORDS = "word_0, word_1, word_2, word_3"  # the state of the noise's stream
 _STORED = "stream[4], stream[5], stream[6], stream[7]"
+
+# The rest of the drift, and what it adds in a step, in the exponential scheme: of a path, and without noise
+_PUSHES = (("rest", "push"), ("calm", "hence"))
+
+_WIDE = ("x", "y", "f", "a", "b", "h", "change", "copy", "lead", *_PUSHES[0], *_PUSHES[1])  # arrays of a kernel
 
 NJIT = '@njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)'
 """Of what ``run`` alone calls: wrappers for other callers cost a fifth of the time to compile."""
@@ -36,7 +44,7 @@ from numba import njit
 
 from certbound.simulation.compiled.elementary import atan2, sincos, tanh
 from certbound.simulation.compiled.entry import KERNEL
-from certbound.simulation.compiled.streams import draw_{variate}, uniform
+from certbound.simulation.compiled.streams import draw_{variate}, stream_of, uniform
 from certbound.simulation.compiled.supremum import STRETCH, bin_of, crossed, raise_top, rise_between, touches
 
 '''
@@ -56,7 +64,8 @@ def kernel_source(model: StepModel, task: Task) -> tuple[str, Array]:
     """Source of the kernel and the parameter array ``p`` that it reads.
 
     The module defines ``run``, whose arrays are prepared by `certbound.simulation.blocks`. It returns the
-    number of steps done, or -1 after writing (path, step, state) of the last finite state to ``notes``.
+    number of steps done, or -1 after writing (path, step, state) of the last finite state to ``notes``. Exits are
+    written to ``out`` too, where it has rows, path by path; each path then has a stream of its own for its noise.
     """
     p = start_text(model)
     functions = function_lines(model, p)
@@ -64,6 +73,8 @@ def kernel_source(model: StepModel, task: Task) -> tuple[str, Array]:
     begin, within, end, finish = task_source(task, model.dimension, bridge, nominal_lines(model, p), p)
     start = [*load_lines(model, "starts[path, {0}]", p), *begin]
     loop = [*step, *within, *each("x_{0} = y_{0}", model.dimension, p), *end]
+    if task.kind == "exits":
+        start = ["if out.shape[0] > 0:", f"    {_WORDS} = stream_of(stream, path)", *start]
     path = [*start, "for k in range(steps):", *indent(loop), *finish]
     body = [*open_noise(model, p), "done = 0", "for path in range(starts.shape[0]):", *indent(path), "return done"]
     text = module_text(model, task.kind, functions, p) + SIGNATURE + kernel_body(body, p)
@@ -112,7 +123,7 @@ def open_noise(model: StepModel, p: Parameters) -> list[str]:
     """Lines that take up the stream of the noise, and make the arrays that a path needs."""
     lines = [f"noise = np.empty({model.noise_count})", f"{_WORDS} = {_STORED}"]
     if p.wide:
-        lines += [f"{state} = np.empty({model.dimension})" for state in "xyfabh"]
+        lines += [f"{state} = np.empty({model.dimension})" for state in _WIDE]
         lines += [f"values = np.empty({values_count(model.drift)})"]
     return lines
 
@@ -129,21 +140,22 @@ def load_lines(model: StepModel, start: str, p: Parameters) -> list[str]:
     return [*lines, "wait = 0"] if model.switching > 0.0 else lines
 
 
-def step_lines(model: StepModel, p: Parameters) -> tuple[list[str], Bridge | None]:
-    """Lines that go from the state x_i at step k to the state y_i, and the bridge between them."""
-    if p.wide:
-        noise_lines, new_state, bridge = _wide_noise(model, p)
-        finite = ["odd = 0.0", *each("odd += y_{0} - y_{0}", model.dimension, p)]
+def step_lines(model: StepModel, p: Parameters, first: str = "") -> tuple[list[str], Bridge | None]:
+    """Lines that go from the state x_i at step k to the state y_i, and the bridge between them.
+
+    ``first`` names the step where the path begins, 0 where it is left out.
+    """
+    if model.exponential is not None:
+        move, bridge = _exponential_lines(model, p, first)
     else:
-        noise_lines, new_state, bridge = _noise(model, p)
-        finite = _sum("odd", [f"(y_{i} - y_{i})" for i in range(model.dimension)])
+        move, bridge = _euler_lines(model, p)
+    finite = _sum("odd", [f"(y_{i} - y_{i})" for i in range(model.dimension)])
+    if p.wide:
+        finite = ["odd = 0.0", *each("odd += y_{0} - y_{0}", model.dimension, p)]
     lines = [
         f"t = k * {p.add(model.interval)}",
         *_inputs(model, p),
-        *_disturbance(model, p),
-        _drift_call(model, "x", "f", p),
-        *noise_lines,
-        *new_state,
+        *move,
         *finite,
         "if odd != 0.0:",
         "    notes[0], notes[1] = path, k",
@@ -152,6 +164,34 @@ def step_lines(model: StepModel, p: Parameters) -> tuple[list[str], Bridge | Non
         "done += 1",
     ]
     return lines, bridge
+
+
+def _euler_lines(model: StepModel, p: Parameters) -> tuple[list[str], Bridge | None]:
+    """Lines that set the new state, in Euler's and Milstein's schemes and in discrete time, and the bridge."""
+    noise_lines, new_state, bridge = (_wide_noise if p.wide else _noise)(model, p)
+    return [*_disturbance(model, p, "x"), _drift_call(model, "x", "f", p), *noise_lines, *new_state], bridge
+
+
+def _exponential_lines(model: StepModel, p: Parameters, first: str) -> tuple[list[str], Bridge | None]:
+    """Lines that set the new state in the exponential scheme, and the bridge."""
+    if p.wide:
+        drawn, noise = _wide_draws(model), product(np.asarray(model.noise), "noise", "y", p)
+        bridge = _bridge(model)
+    else:
+        drawn, noise, bridge = _shocks(model, p)
+    if isinstance(model.noise, Tape):  # half of the step is left for it to move on
+        half = exponential_step(model.exponential.base, 0.5 * model.step).move  # type: ignore[union-attr]
+        drawn += [f"shock_{i} = {shock}" for i, shock in enumerate(noise)]
+        noise = [linear_form(row.tolist(), vector("shock", model.dimension), p) for row in half]
+    switched = _disturbance(model, p, "x")
+    drift = [_drift_call(model, "x", "f", p)], [*_later(model, p), _drift_call(model, "lead", "f", p, model.step)]
+    begins = pair_begins(model, first)
+    return [*switched, *drawn, *move_lines(model, ("x", "y", *_PUSHES[0]), drift, begins, p, noise)], bridge
+
+
+def _later(model: StepModel, p: Parameters) -> list[str]:
+    """Lines that set a disturbance that reacts to the state, at the state "lead" a step later."""
+    return _disturbance(model, p, "lead", model.step) if model.signal is not None else []
 
 
 def _sum(name: str, terms: Sequence[str]) -> list[str]:
@@ -170,42 +210,47 @@ def _inputs(model: StepModel, p: Parameters) -> list[str]:
     return [*lines, f"if k % int({p.add(model.every)}) == 0:", f"    {call}"]
 
 
-def nominal_lines(model: StepModel, p: Parameters) -> list[str]:
+def nominal_lines(model: StepModel, p: Parameters, first: str = "") -> list[str]:
     """Lines that advance the noise-free path from a_i to b_i."""
+    if model.exponential is not None:
+        drift = [_drift_call(model, "a", "f", p)], [_drift_call(model, "lead", "f", p, model.step)]
+        return move_lines(model, ("a", "b", *_PUSHES[1]), drift, pair_begins(model, first), p)
     call = _drift_call(model, "a", "h", p)
     if p.wide:
         return [call, *_wide_move(model, "a", "h", "b", p)]
     return [call, *[f"b_{i} = {value}" for i, value in enumerate(_moved(model, "a", "h", p))]]
 
 
-def _drift_call(model: StepModel, state: str, target: str, p: Parameters) -> str:
-    """The line that sets the drift at a state."""
-    names = _arguments(model, state)
+def _drift_call(model: StepModel, state: str, target: str, p: Parameters, later: float = 0.0) -> str:
+    """The line that sets the drift at a state, now or some seconds later."""
+    time, *names = _arguments(model, state)
+    time = f"{time} + {p.add(later)}" if later else time
     if p.wide:
-        names = ["t", state, *names[1 + model.dimension :], "values", target]
-        return f"drift(p, {', '.join(names)})"
-    return f"{_targets(vector(target, model.dimension))} = drift(p, {', '.join(names)})"
+        return f"drift(p, {', '.join([time, state, *names[model.dimension :], 'values', target])})"
+    return f"{_targets(vector(target, model.dimension))} = drift(p, {', '.join([time, *names])})"
 
 
 def _wide_move(model: StepModel, state: str, drift: str, target: str, p: Parameters) -> list[str]:
     """Lines that set an array to the next state without noise."""
-    if model.flow is not None:
-        return [f"{target}[:] = {state}", *product(model.flow, drift, target, p)]
     moved = f"{state}_{{0}} + {p.add(model.step)} * {drift}_{{0}}" if model.step > 0.0 else f"{drift}_{{0}}"
     return each(f"{target}_{{0}} = {moved}", model.dimension, p)
 
 
 def _wide_noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridge | None]:
     """What `_noise` returns, for states in arrays: the noise has a matrix."""
-    noise = np.asarray(model.noise)
+    new = [*_wide_move(model, "x", "f", "y", p), *product(np.asarray(model.noise), "noise", "y", p)]
+    return _wide_draws(model), new, _bridge(model)
+
+
+def _wide_draws(model: StepModel) -> list[str]:
+    """Lines that draw the variates of a step into the array ``noise``."""
     drawn = [f"for j in range({model.noise_count}):", f"    noise[j], {_WORDS} = draw_{model.variate}({_WORDS})"]
     drawn += ["    noise[j], = unit(p, noise[j])"] if model.unit is not None else []
-    new = [*_wide_move(model, "x", "f", "y", p), *product(noise, "noise", "y", p)]
-    return drawn if model.noise_count else [], new, _bridge(model)
+    return drawn if model.noise_count else []
 
 
 def _bridge(model: StepModel) -> Bridge | None:
-    return Bridge(spread=model.spread) if model.bridge and model.spread is not None else None
+    return Bridge(spread=model.spread, rough=model.rough) if model.bridge and model.spread is not None else None
 
 
 def _arguments(model: StepModel, state: str) -> list[str]:
@@ -219,48 +264,59 @@ def _targets(names: Sequence[str]) -> str:
 
 def _noise(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridge | None]:
     """Lines that draw the variates, lines that give the new state, and the bridge."""
-    m, n = model.noise_count, model.dimension
-    variates = vector("z", m)
-    drawn = []
-    if m:
-        draw = f"{_WORDS} = draw_{model.variate}({_WORDS})"
-        drawn = [f"for j in range({m}):", f"    noise[j], {draw}"] if m > 1 else [f"z_0, {draw}"]
-        drawn += [f"z_{j} = noise[{j}]" for j in range(m)] if m > 1 else []
-        drawn += [f"z_{j}, = unit(p, z_{j})" for j in range(m)] if model.unit is not None else []
-    if isinstance(model.noise, Tape):
-        root = p.add(np.sqrt(model.step) if model.step > 0.0 else 1.0)
-        entries = _entries(model.noise)
-        drawn += [
-            f"{_targets([e if e != '0.0' else '_' for row in entries for e in row])} = "
-            f"diffusion(p, t, {', '.join(vector('x', n))})"
-        ]
-        terms = [" + ".join(f"{e} * {z}" for e, z in zip(row, variates) if e != "0.0") for row in entries]
-        shocks = [f"{root} * ({term})" if term else "0.0" for term in terms]
-        if model.correction is not None:
-            drawn += [f"{_targets(vector('c', n))} = correction(p, t, {', '.join(vector('x', n))})"]
-            half = p.add(0.5 * model.step)
-            own = [row[i] for i, row in enumerate(entries)]  # where one is 0, a root's slope is no number
-            shocks = [
-                f"{s} + ({half} * c_{i} * {e} * (z_{i} * z_{i} - 1.0) if {e} != 0.0 else 0.0)" if e != "0.0" else s
-                for i, (s, e) in enumerate(zip(shocks, own))
-            ]
-        scaled = [[f"({root} * {e})" if e != "0.0" else e for e in row] for row in entries]
-        bridge = Bridge(spread=None, entries=scaled) if model.bridge else None
-    else:
-        shocks = [linear_form(row.tolist(), variates, p) for row in model.noise]
-        bridge = _bridge(model)
-    new = []
-    moves = _moved(model, "x", "f", p) if model.flow is not None else []
-    step = p.add(model.step)
+    drawn, shocks, bridge = _shocks(model, p)
+    new, step = [], p.add(model.step)
     for i, shock in enumerate(shocks):  # noise first: the drift is known last, and its chain of operations is short
-        if model.flow is not None:
-            new.append(f"y_{i} = {moves[i]}" + ("" if shock == "0.0" else f" + ({shock})"))
-        elif model.step > 0.0:
+        if model.step > 0.0:
             noisy = f"x_{i}" if shock == "0.0" else f"(x_{i} + ({shock}))"
             new.append(f"y_{i} = {noisy} + {step} * f_{i}")
         else:
             new.append(f"y_{i} = f_{i}" + ("" if shock == "0.0" else f" + ({shock})"))
     return drawn, new, bridge
+
+
+def _shocks(model: StepModel, p: Parameters) -> tuple[list[str], list[str], Bridge | None]:
+    """Lines that draw the variates, the noise of a step by state ("0.0" for none), and the bridge."""
+    drawn = _draws(model, p)
+    if not isinstance(model.noise, Tape):
+        names = vector("z", model.noise_count)
+        return drawn, [linear_form(row.tolist(), names, p) for row in model.noise], _bridge(model)
+    n, variates = model.dimension, vector("z", model.noise.shape[1])
+    root = p.add(np.sqrt(model.step) if model.step > 0.0 else 1.0)
+    entries = _entries(model.noise)
+    drawn += [
+        f"{_targets([e if e != '0.0' else '_' for row in entries for e in row])} = "
+        f"diffusion(p, t, {', '.join(vector('x', n))})"
+    ]
+    terms = [" + ".join(f"{e} * {z}" for e, z in zip(row, variates) if e != "0.0") for row in entries]
+    shocks = [f"{root} * ({term})" if term else "0.0" for term in terms]
+    if model.correction is not None:
+        drawn += [f"{_targets(vector('c', n))} = correction(p, t, {', '.join(vector('x', n))})"]
+        half = p.add(0.5 * model.step)
+        own = [row[i] for i, row in enumerate(entries)]  # where one is 0, a root's slope is no number
+        shocks = [
+            f"{s} + ({half} * c_{i} * {e} * (z_{i} * z_{i} - 1.0) if {e} != 0.0 else 0.0)" if e != "0.0" else s
+            for i, (s, e) in enumerate(zip(shocks, own))
+        ]
+    scaled = [[f"({root} * {e})" if e != "0.0" else e for e in row] for row in entries]
+    return drawn, shocks, Bridge(spread=None, entries=scaled) if model.bridge else None
+
+
+def _draws(model: StepModel, p: Parameters) -> list[str]:
+    """Lines that draw the variates z_j of a step; those of its pieces are added up where the noise is a tape."""
+    count = model.noise_count
+    if not count:
+        return []
+    draw = f"{_WORDS} = draw_{model.variate}({_WORDS})"
+    m = int(model.noise.shape[1])
+    drawn = [f"for j in range({count}):", f"    noise[j], {draw}"] if count > 1 else [f"z_0, {draw}"]
+    if count > m:
+        scale = p.add(float(np.sqrt(m / count)))
+        parts = [" + ".join(f"noise[{k}]" for k in range(j, count, m)) for j in range(m)]
+        drawn += [f"z_{j} = {scale} * ({part})" for j, part in enumerate(parts)]
+    elif count > 1:
+        drawn += [f"z_{j} = noise[{j}]" for j in range(m)]
+    return drawn + ([f"z_{j}, = unit(p, z_{j})" for j in range(m)] if model.unit is not None else [])
 
 
 def _entries(tape: Tape) -> list[list[str]]:
@@ -271,11 +327,12 @@ def _entries(tape: Tape) -> list[list[str]]:
     ]
 
 
-def _disturbance(model: StepModel, p: Parameters) -> list[str]:
-    """Lines that set the disturbance of this step."""
+def _disturbance(model: StepModel, p: Parameters, state: str, later: float = 0.0) -> list[str]:
+    """Lines that set the disturbance of this step, or what it is some seconds later at a state."""
     count = model.disturbance_count
     if model.signal is not None:
-        lines = [f"{_targets(vector('d', count))} = signal(p, t, {', '.join(vector('x', model.dimension))})"]
+        time = f"t + {p.add(later)}" if later else "t"
+        lines = [f"{_targets(vector('d', count))} = signal(p, {time}, {', '.join(vector(state, model.dimension))})"]
         bounds = zip(model.low, model.high, strict=True)
         return lines + [f"d_{i} = min(max(d_{i}, {p.add(low)}), {p.add(high)})" for i, (low, high) in enumerate(bounds)]
     if model.switching <= 0.0:
@@ -290,9 +347,6 @@ def _disturbance(model: StepModel, p: Parameters) -> list[str]:
 
 def _moved(model: StepModel, state: str, drift: str, p: Parameters) -> list[str]:
     """Expressions of the next state without noise."""
-    if model.flow is not None:
-        names = vector(drift, model.dimension)
-        return [f"{state}_{i} + {linear_form(row.tolist(), names, p)}" for i, row in enumerate(model.flow)]
     if model.step <= 0.0:
         return vector(drift, model.dimension)
     step = p.add(model.step)

@@ -14,7 +14,7 @@ from certbound.problem.model import Node, Tape, compile_numpy, edged, is_zero, j
 from certbound.problem.noise import Law, check_law
 from certbound.problem.random_constants import Random
 from certbound.simulation.tape_text import live_nodes
-from certbound.simulation.transition import bridge_shares, exact_transition
+from certbound.simulation.transition import bridge_spread, exact_transition
 
 _LARGEST_EXACT = 16
 
@@ -31,7 +31,7 @@ class Scenario:
 
     # Continuous time only. ``auto`` takes the exact transition of a linear system of up to 16 states, Milstein's scheme
     # where the diffusion is diagonal and entry i depends on state i alone, and Euler-Maruyama otherwise; where that
-    # would need shorter steps, and the diffusion is constant, the exponential scheme of ``stiffness``.
+    # would need shorter steps than a thousandth of the horizon, the exponential scheme of ``stiffness``.
     scheme: Literal["auto", "exact", "milstein", "euler"] = "auto"
     bridge: bool = True  # continuous time only: look for exits between two steps with a Brownian bridge
     # (n,): one start for all paths; otherwise X_0 is uniform in the problem's initial set (or drawn from its law)
@@ -53,6 +53,23 @@ class Scenario:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Exponential:
+    """Matrices (n, n) of the exponential midpoint rule, over one step h; see ``stiffness``.
+
+    Pairs of steps share one rest of the drift, N(x) = f(x) - base x, taken where the first of them ends; on
+    modes that die out within a step it is taken where each ends.
+    """
+
+    base: Array  # J, 1/s
+    move: Array  # e^{h J}
+    response: Array  # int_0^h e^{s J} ds: what the rest of the drift adds in a step
+    lead: Array  # what it adds to the state where it is taken anew
+    # what its change in the first step takes off, and that in the second adds; of modes that die out within a step
+    first: Array
+    second: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class StepModel:
     """One step of a system, as numbers and tapes."""
 
@@ -69,11 +86,13 @@ class StepModel:
     unit: Tape | None = None  # z as a function of v, entry by entry; without it z = v
     # (n, m): what multiplies z. A tape (inputs t, states; shape (n, m)) is multiplied by sqrt(step) too.
     noise: Array | Tape
-    # (n, n), of the exponential scheme: without noise the state moves by ``flow`` times the drift
-    flow: Array | None = None
+    carry: Array | None = None  # (n, n): what a step makes of noise of the step before; None: nothing
+    exponential: Exponential | None = None  # how the state moves without noise, where not by Euler's scheme
+    pieces: int = 1  # parts of a step, each with variates of its own; of a tape of noise they are added up
     correction: Tape | None = None  # diagonal of d g_ii/d x_i, for Milstein's scheme
     # (n, m): g sqrt(h) of the bridge between two steps; None in discrete time, and where ``noise`` is a tape
     spread: Array | None = None
+    rough: Array | None = None  # (n, k): where rows are 0 states are smooth on a step; None: where those of spread are
     bridge: bool = False  # whether exits between steps are looked for
     signal: Tape | None = None  # disturbance as a function of (t, states)
     # (disturbance_count,): the disturbance's box
@@ -86,12 +105,13 @@ class StepModel:
     # inputs that are held, the first ones: a function of (t, states), computed every so many steps
     law: Tape | None = None
     every: int = 0
+    constant: int = 0  # steps after which inputs may change, where they do so at equal distances; else 0
     scheme: str = "discrete"  # what was chosen: ``exact``, ``milstein``, ``euler``, ``exponential`` or ``discrete``
 
     @property
     def noise_count(self) -> int:
-        """Number m of variates that a step needs."""
-        return int(self.noise.shape[1])
+        """Number of variates that a step needs."""
+        return int(self.noise.shape[1]) * (self.pieces if isinstance(self.noise, Tape) else 1)
 
     @property
     def held_count(self) -> int:
@@ -132,6 +152,8 @@ def step_model(problem: Any, steps: int, scenario: Scenario) -> StepModel:
         inputs, disturbances = inputs + disturbances, 0
     fields |= {"input_count": inputs, "disturbance_count": disturbances}
     fields["table"] = np.hstack(rows) if rows else np.zeros((0, 0))
+    pieces = problem.samples if held else len(sequence) if sequence is not None and len(rows) == 1 else 0
+    fields["constant"] = steps // pieces if pieces and steps % pieces == 0 else 0
     if system.time == "discrete":
         law: Law = system.noise
         check_law(law, "be simulated")
@@ -225,8 +247,8 @@ def _continuous(
     if linear is not None and (n <= _LARGEST_EXACT or wanted == "exact"):
         transition, offset, factor = exact_transition(*linear, np.asarray(diffusion), step)
         drift = _affine_tape(tape.inputs, np.hstack([np.zeros((n, 1)), transition]), offset)
-        spread *= bridge_shares(linear[0][:, :n], np.asarray(diffusion), step)[:, None]
-        return StepModel(drift=drift, noise=factor, spread=spread, scheme="exact", **fields)
+        spread = bridge_spread(linear[0][:, :n], np.asarray(diffusion), step)
+        return StepModel(drift=drift, noise=factor, spread=spread, carry=transition[:, :n], scheme="exact", **fields)
     if wanted in ("exact", "milstein"):
         need = "a linear system with constant coefficients" if wanted == "exact" else "a state-dependent diffusion"
         raise ValueError(f"`scheme` {wanted!r} needs {need}; use 'auto'.")

@@ -77,9 +77,17 @@ def _exits(task: Task, bridge: Bridge | None, p: Parameters) -> Lines:
         column += len(task.goal.matrix) if task.goal.moving else 0
         keep = barrier_source(number + 1, task.keep, bridge, p, column)
         return _kept_goal(number, goal, keep, (begin, within, end))
-    begin += ["if left >= 0:", "    counts[left, 0] += 1", "    continue"]
-    within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
+    begin += ["if left >= 0:", *indent([*_count("left", "0"), "continue"])]
+    within += ["if left >= 0:", *indent([*_count("left", _BIN), "break"])]
     return begin, within, end, []
+
+
+_BIN = "1 + k * (counts.shape[1] - 1) // steps"
+
+
+def _count(row: str, column: str) -> list[str]:
+    """Lines that count a path that fails, and write the row, from 1 on, to where its outcome is asked."""
+    return [f"counts[{row}, {column}] += 1", "if out.shape[0] > 0:", f"    out[path, 0, 0] = {row} + 1.0"]
 
 
 def _until_goal(
@@ -87,10 +95,11 @@ def _until_goal(
 ) -> Lines:
     """A path ends without failing when it runs into the goal; one that never does fails as its window ends."""
     begin, within, end = lines[0], lines[1], lines[2] + watch[2]
-    begin += ["if left >= 0:", "    counts[left, 0] += 1", "    continue", *watch[0], "if left >= 0:", "    continue"]
-    within += ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
+    begin += ["if left >= 0:", *indent([*_count("left", "0"), "continue"])]
+    begin += [*watch[0], "if left >= 0:", "    continue"]
+    within += ["if left >= 0:", *indent([*_count("left", _BIN), "break"])]
     within += [*watch[1], "if left >= 0:", "    break", f"if k + 1 >= windows[{number}, 1]:", "    break"]
-    return begin, within, end, ["if left < 0:", f"    counts[{number}, counts.shape[1] - 1] += 1"]
+    return begin, within, end, ["if left < 0:", *indent(_count(str(number), "counts.shape[1] - 1"))]
 
 
 def _kept_goal(
@@ -98,13 +107,13 @@ def _kept_goal(
     lines: tuple[list[str], list[str], list[str]],
 ) -> Lines:  # fmt: skip
     """A path fails that leaves the goal once it has run into it, or never does (in discrete time: no bridges)."""
-    leaves = ["if left >= 0:", "    counts[left, 1 + k * (counts.shape[1] - 1) // steps] += 1", "    break"]
+    leaves = ["if left >= 0:", *indent([*_count("left", _BIN), "break"])]
     arrives = ["if left >= 0:", "    left = -1", "    arrived = True"]
-    begin = [*lines[0], "if left >= 0:", "    counts[left, 0] += 1", "    continue"]
+    begin = [*lines[0], "if left >= 0:", *indent([*_count("left", "0"), "continue"])]
     begin += [*keep[0], "left = -1", *watch[0], "arrived = False", *arrives]
     within = [*lines[1], *leaves, "if arrived:", *indent([*keep[1], *leaves]), "else:", *indent([*watch[1], *arrives])]
     within += [f"if not arrived and k + 1 >= windows[{number}, 1]:", "    break"]
-    finish = ["if left < 0 and not arrived:", f"    counts[{number}, counts.shape[1] - 1] += 1"]
+    finish = ["if left < 0 and not arrived:", *indent(_count(str(number), "counts.shape[1] - 1"))]
     return begin, within, [*lines[2], *keep[2], *watch[2]], finish
 
 

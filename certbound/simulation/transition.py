@@ -8,6 +8,8 @@ import numpy as np
 
 from certbound.arrays import Array
 
+_SMOOTH = 0.25  # variance of a bridge over that of a step's noise, between that of positions and that of noisy states
+
 
 def exact_transition(matrix: Array, offset: Array, diffusion: Array, step: float) -> tuple[Array, Array, Array]:
     """The law of x(h) for dx = (A x + B v + b) dt + G dW with v constant: N(F x + E v + e, L L').
@@ -45,26 +47,31 @@ def exact_transition(matrix: Array, offset: Array, diffusion: Array, step: float
     return move[:, :width], move[:, width], _factor((covariance + covariance.T) / 2)
 
 
-def bridge_shares(matrix: Array, diffusion: Array, step: float) -> Array:
-    """What is left of a Brownian bridge's standard deviation in the middle of a step, by state, shape (n,).
+def bridge_spread(matrix: Array, diffusion: Array, step: float) -> Array:
+    """The noise of a Brownian bridge that is as wide in the middle of a step as the path between its ends, (n, k).
 
-    For dx = A x dt + G dW, given both ends; a mode that dies out within a step keeps to them more closely than a
-    Brownian motion, by sqrt(tanh(a h/2)/(a h/2)) at rate -a. States without noise of their own have 1.
+    For dx = A x dt + G dW, given both ends. A mode that dies out within a step keeps to them more closely than a
+    Brownian motion, by sqrt(tanh(a h/2)/(a h/2)) at rate -a; what follows noise at once spreads as that does. Rows
+    of states that are smooth on a step, as positions, are 0: a bridge is a sixteenth as wide there as the noise of a
+    step (in variance), and as wide where noise acts.
 
     Examples
     --------
-    >>> share = bridge_shares(np.array([[-8.0]]), np.array([[1.0]]), 0.5)
-    >>> bool(np.isclose(share[0] ** 2, np.tanh(2.0) / 2.0))
+    >>> spread = bridge_spread(np.array([[-8.0]]), np.array([[1.0]]), 0.5)
+    >>> bool(np.isclose(spread[0, 0] ** 2, 0.5 * np.tanh(2.0) / 2.0))
     True
     """
     n = len(matrix)
     move, _, factor = exact_transition(matrix, np.zeros(n), diffusion, step / 2.0)
     half = factor @ factor.T
+    scale = np.sqrt(np.diag(move @ half @ move.T + half))
+    inverse = np.divide(1.0, scale, out=np.zeros(n), where=scale > 0.0)
+    half, move = half * np.outer(inverse, inverse), inverse[:, None] * move * scale
     reach = move @ half
-    gain = np.linalg.lstsq(reach @ move.T + half, reach, rcond=None)[0]
-    left = np.diag(half) - np.sum(reach * gain, axis=0)
-    own = np.sum(diffusion**2, axis=1) * step / 4.0
-    return np.asarray(np.sqrt(np.maximum(np.divide(left, own, out=np.ones(n), where=own > 0.0), 0.0)))
+    left = half - reach.T @ np.linalg.lstsq(reach @ move.T + half, reach, rcond=None)[0]
+    rough = 4.0 * np.diag(left) > _SMOOTH
+    spread = 2.0 * scale[:, None] * _factor(0.5 * (left + left.T) * np.outer(rough, rough))
+    return spread if spread.shape[1] else np.zeros((n, 1))
 
 
 def _factor(covariance: Array) -> Array:

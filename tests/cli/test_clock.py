@@ -233,7 +233,7 @@ def test_as_many_paths_are_simulated_as_fit(
     assert run([*words, "--paths", "10"]) == 0  # compiles
     capsys.readouterr()
     started = time.perf_counter()
-    code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "2")
+    code, found = answer(capsys, *words, "--paths", "1e12", "--time-limit", "3")
     assert code == 0
     assert 2000 < found["paths"] < 1e12 == found["asked"]
     assert time.perf_counter() - started < 15

@@ -225,7 +225,7 @@ class Run:
 
         def by_certbound(steps: int) -> tuple[int, int]:
             options = {"steps": steps} if self.draft.continuous else {}
-            counts = cb.simulate_exits(self.problem, paths=PATHS, rng=self.rng(3), **options)
+            counts = cb.simulate_exits(self.problem, paths=PATHS, rng=self.rng(3), halve=False, **options)
             return counts.exits, counts.paths
 
         if worst.lower > level:
@@ -388,7 +388,7 @@ class Run:
     def _outside_tube(self, tube: Any, constants: Any, steps: int) -> tuple[int, int]:
         """Paths whose distance from the noise-free path of the same start exceeds the radius at some time.
 
-        Only where the disturbance is constant, so that both paths meet the same one; both by Euler's scheme.
+        Only where the disturbance is constant, so that both paths meet the same one; both by one scheme.
         """
         draft, units = self.draft, self.draft.units
         quiet = _without_noise(draft)

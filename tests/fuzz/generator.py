@@ -15,7 +15,7 @@ import certbound as cb
 from tests.fuzz.drafts import Draft, Noise, Shape, Units, Wall
 from tests.fuzz.formulas import JUMPS, KINKS, Formula, apply, number, symbol
 from tests.fuzz.oracle import Policy, follow, starts
-from tests.fuzz.sketches import Sketch, between, log_uniform, sketch
+from tests.fuzz.sketches import Sketch, between, compared, log_uniform, sketch, sketch_of
 
 __all__ = ["draw"]
 
@@ -52,12 +52,19 @@ def draw(seed: int) -> tuple[Draft, cb.Problem]:
 
 
 def _draft(seed: int, rng: Random) -> Draft | None:
+    own = np.random.default_rng([seed, 47])  # what is drawn from these leaves the other numbers as they are
     name, model = sketch(rng)
+    roll = own.random(3)
+    if roll[0] < 0.12:
+        name, model = "light_oscillator", sketch_of("light_oscillator", rng)
+    if roll[1] < 0.12:
+        model = _with_comparison(own, model)
     n = len(model.dynamics)
     dynamics, inputs, plan = _inputs(rng, model)
     half = rng.choice([1e-3, 0.1, 1.0]) * np.array([0.2] * model.disturbance)
+    start = _start(rng, model, own if roll[2] < 0.12 else None)
     draft = Draft(
-        seed=seed, family=name, continuous=model.continuous, dynamics=dynamics, start=_start(rng, model), walls=(),
+        seed=seed, family=name, continuous=model.continuous, dynamics=dynamics, start=start, walls=(),
         horizon=model.horizon, delta=log_uniform(rng, *((1e-9, 1e-3) if rng.random() < 0.4 else (1e-3, 0.3))),
         diffusion=_diffusion(rng, model), noise=_noise(rng, model),
         disturbance=(-half, half * rng.choice([0.0, 0.5, 1.0])) if model.disturbance else None,
@@ -149,10 +156,22 @@ def _inputs(rng: Random, model: Sketch) -> tuple[tuple[Formula, ...], Any, Any]:
     return tuple(rows), box, (law,)
 
 
-def _start(rng: Random, model: Sketch) -> tuple[str, Any, Any]:
+def _with_comparison(rng: Random, model: Sketch) -> Sketch:
+    """The model with a comparison of constants in one of its rows."""
+    rows, i = list(model.dynamics), int(rng.integers(len(model.dynamics)))
+    rows[i] = rows[i] + compared(rng, model.horizon, model.continuous)
+    return replace(model, dynamics=rows, matrices=None)
+
+
+def _start(rng: Random, model: Sketch, gaussian: Random | None) -> tuple[str, Any, Any]:
+    """A start of any kind; with ``gaussian`` a normal one, whose correlations and size are drawn from these numbers."""
     center, n = np.array(model.center), len(model.center)
     width = model.width * rng.choice([1e-6, 0.1, 1.0, 2.0], p=[0.05, 0.25, 0.5, 0.2])
     kind = str(rng.choice(["point", "box", "ball", "ellipsoid", "gaussian"], p=[0.35, 0.35, 0.1, 0.1, 0.1]))
+    if gaussian is not None:
+        turn = np.linalg.qr(gaussian.standard_normal((n, n)))[0]
+        stds = model.width * 10.0 ** gaussian.uniform(-1.0, 1.0, n) * (gaussian.random(n) < 0.85)
+        return "gaussian", center, turn @ np.diag(stds**2) @ turn.T
     if kind == "point":
         return "box", center, center
     if kind == "box":
@@ -398,8 +417,7 @@ def _formulas(draft: Draft) -> list[Formula]:
 def _route(rng: Random, draft: Draft) -> str:
     if draft.matrices is not None and rng.random() < 0.6:
         return "linear"
-    jumps = set().union(*(row.operations() for row in _formulas(draft))) & JUMPS
-    allowed = not jumps and not isinstance(draft.plan, np.ndarray)
+    allowed = not any(_jumps(row) for row in _formulas(draft)) and not isinstance(draft.plan, np.ndarray)
     return "file" if allowed and rng.random() < 0.4 else "python"
 
 
@@ -414,6 +432,7 @@ def _features(draft: Draft) -> frozenset[str]:
         "model: smooth" if not used & (JUMPS | KINKS) else "",
         "model: kink" if used & KINKS else "",
         "model: jump" if used & JUMPS else "",
+        "model: comparison of constants" if any(_compares(row) for row in _formulas(draft)) else "",
         "model: in t" if any("t" in row.symbols() for row in draft.dynamics) else "",
         "noise: none" if not draft.diffusion and draft.noise is None else "",
         f"noise: {draft.noise.law} {draft.noise.level}" if draft.noise else "",
@@ -437,6 +456,20 @@ def _features(draft: Draft) -> frozenset[str]:
         if wall.during is not None:
             found.add("wall: at the end" if wall.during[0] == draft.horizon else "wall: window")
     return frozenset(found - {""})
+
+
+def _compares(formula: Formula) -> bool:
+    """Whether a decision somewhere rests on no state."""
+    return _known(formula) or any(_compares(argument) for argument in formula.args)
+
+
+def _known(formula: Formula) -> bool:
+    return formula.op == "where" and not formula.args[0].symbols() - {"t"}
+
+
+def _jumps(formula: Formula) -> bool:
+    """Whether something jumps by the state."""
+    return (formula.op in JUMPS and not _known(formula)) or any(_jumps(argument) for argument in formula.args)
 
 
 def _is_point(draft: Draft) -> bool:

@@ -1,8 +1,9 @@
 """Monte Carlo of its own, in the draft's units: nothing of certbound runs here but the limits of Clopper and Pearson.
 
 Starts are corners and random points of the initial set, disturbances are constant vertices and laws that push along a
-direction; the worst pair of a pilot run is simulated afresh, so that the choice biases nothing. In continuous time
-exits are looked for on a grid only, by Euler-Maruyama: a contradiction counts only where finer grids confirm it.
+direction; the worst pair of a pilot run is simulated afresh, so that the choice biases nothing. In continuous time a
+step is the drift's flow by Runge and Kutta, which neither damps nor drives a light oscillator, and then noise; between
+two steps exits are looked for by Brownian bridges. A contradiction counts only where finer grids confirm it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certbound.simulation.estimates.statistics import bound_binomial
-from tests.fuzz.drafts import Draft, Wall
+from tests.fuzz.bridges import touched
+from tests.fuzz.drafts import Draft, Shape, Wall
 
 __all__ = ["CONFIDENCE", "Count", "Policy", "exits", "follow", "lower_limit", "starts", "worst_case"]
 
@@ -159,13 +161,18 @@ class _Model:
         names = self.names(t, x)
         return np.stack([np.broadcast_to(row.value(names), len(x)) for row in self.draft.dynamics], axis=1)
 
-    def spread(self, t: float, x: Array, z: Array) -> Array:
-        """g(t, x) z."""
+    def diffusion(self, t: float, x: Array) -> Array:
+        """g(t, x), shape (paths, n, columns)."""
         names = self.names(t, x)
         rows = [
-            sum(np.asarray(entry.value(names)) * z[:, k] for k, entry in enumerate(row)) for row in self.draft.diffusion
+            np.stack([np.broadcast_to(np.asarray(entry.value(names), dtype=float), len(x)) for entry in row], axis=1)
+            for row in self.draft.diffusion
         ]
-        return np.stack([np.broadcast_to(np.asarray(row, dtype=float), len(x)) for row in rows], axis=1)
+        return np.stack(rows, axis=1)
+
+    def spread(self, t: float, x: Array, z: Array) -> Array:
+        """g(t, x) z."""
+        return np.asarray(np.einsum("pnc,pc->pn", self.diffusion(t, x), z))
 
 
 def follow(
@@ -177,7 +184,7 @@ def follow(
     policy: Signal | None = None,
     noise: bool = True,
 ) -> Iterator[tuple[float, Array]]:
-    """Times and states, shape (paths, n), step by step; without noise by the classical Runge-Kutta scheme."""
+    """Times and states, shape (paths, n), step by step; the drift by the classical Runge-Kutta scheme."""
     model, x = _Model(draft, policy), np.array(start, dtype=float)
     yield 0.0, x
     if not draft.continuous:
@@ -192,13 +199,10 @@ def follow(
     columns = len(draft.diffusion[0]) if draft.diffusion else 0
     for k in range(steps):
         t, model.row = k * h, k * pieces // steps
-        if not noise:
-            x = _runge_kutta(model, t, x, h)
-        elif columns:
-            z = rng.standard_normal((len(x), columns)) * np.sqrt(h)
-            x = x + h * model.drift(t, x) + model.spread(t, x, z)
-        else:
-            x = x + h * model.drift(t, x)
+        moved = _runge_kutta(model, t, x, h)
+        if noise and columns:
+            moved = moved + model.spread(t, x, rng.standard_normal((len(x), columns)) * np.sqrt(h))
+        x = moved
         yield (k + 1) * h, x
 
 
@@ -227,17 +231,50 @@ def arrived(target: Wall, t: float, x: Array, horizon: float) -> NDArray[np.bool
     return target.shape.contains(x, t, EDGE)
 
 
+class _Between:
+    """What happens between two times of the grid: by bridges, where there is noise in continuous time."""
+
+    def __init__(self, draft: Draft, policy: Signal | None, noise: bool, rng: np.random.Generator) -> None:
+        self.draft, self.rng = draft, rng
+        self.model = _Model(draft, policy) if draft.continuous and noise and draft.diffusion else None
+        self.ends: tuple[float, Array, float, Array] | None = None
+        self.noise: Array = np.zeros(0)
+
+    def step(self, t: float, x: Array) -> None:
+        """Go on to a state, of which a copy is kept."""
+        if self.model is None:
+            return
+        last = (t, x) if self.ends is None else self.ends[2:]
+        self.ends = (*last, t, x.copy())
+        self.noise = self.model.diffusion(*last) * np.sqrt(max(t - last[0], 0.0))
+
+    def touches(self, shape: Shape, inside: bool, during: tuple[float, float] | None, slack: float) -> Any:
+        """Which paths leave a set, or meet it, in between; nobody where it does not hold all the while."""
+        if self.model is None or self.ends is None or self.ends[0] == self.ends[2]:
+            return False
+        edge = 1e-9 * self.draft.horizon
+        if during is not None and not (during[0] - edge <= self.ends[0] and self.ends[2] <= during[1] + edge):
+            return False
+        return touched(shape, inside, self.ends, self.noise, slack, self.rng)
+
+
 def exits(
     draft: Draft, start: Array, rng: np.random.Generator, *, steps: int, policy: Signal | None, noise: bool = True
 ) -> NDArray[np.bool_]:
     """Which paths break a wall, or leave the domain; with a target, before they are in it, or are never in it."""
     gone, there = np.zeros((2, len(start)), dtype=bool)
-    domain, finite = draft.domain, np.ones(len(start), dtype=bool)
+    domain, target, finite = draft.domain, draft.target, np.ones(len(start), dtype=bool)
+    walls = list(draft.walls) + ([] if domain is None else [Wall(shape=Shape(kind="box", data=domain))])
+    between = _Between(draft, policy, noise, rng)
     with np.errstate(all="ignore"):
         for t, x in follow(draft, start, rng, steps=steps, policy=policy, noise=noise):
+            between.step(t, x)
             finite &= np.all(np.isfinite(x), axis=1)
-            if draft.target is not None:
-                there |= ~gone & arrived(draft.target, t, x, draft.horizon)
+            for wall in walls:  # between two steps first: who has arrived by the end may have failed before
+                gone |= finite & ~there & between.touches(wall.shape, wall.inside, wall.during, EDGE)
+            if target is not None:
+                there |= finite & ~gone & between.touches(target.shape, False, target.during, -EDGE)
+                there |= ~gone & arrived(target, t, x, draft.horizon)
             usable = finite & ~there
             for wall in draft.walls:
                 gone |= usable & broken(wall, t, x, draft.horizon)
@@ -245,7 +282,7 @@ def exits(
                 gone |= usable & np.any((x < domain[0]) | (x > domain[1]), axis=1)
             if np.any(gone):
                 x[gone] = start[gone]  # in place: a path that left goes on where it can do no harm
-    return gone if draft.target is None else gone | (finite & ~there)
+    return gone if target is None else gone | (finite & ~there)
 
 
 def worst_case(draft: Draft, rng: np.random.Generator, *, paths: int, pilot: int = 1000) -> tuple[Count, Policy | None]:

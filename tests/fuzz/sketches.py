@@ -34,12 +34,19 @@ class Sketch:
 
 
 FAMILIES: dict[str, Callable[[Random], Sketch]] = {}
+LATER: dict[str, Callable[[Random], Sketch]] = {}
+"""Families that are drawn from numbers of their own, so that a seed that draws none is the problem that it was."""
 
 
 def family(function: Callable[[Random], Sketch]) -> Callable[[Random], Sketch]:
     """Enter a model into the table under its function's name."""
     FAMILIES[function.__name__] = function
     return function
+
+
+def sketch_of(name: str, rng: Random) -> Sketch:
+    """A model of a family."""
+    return (FAMILIES | LATER)[name](rng)
 
 
 def sketch(rng: Random) -> tuple[str, Sketch]:
@@ -475,3 +482,45 @@ def springs(rng: Random) -> Sketch:
 @family
 def disturbed_decay(rng: Random) -> Sketch:
     return _flow([-x(0) + 0.3 * D * x(0), -2 * x(1) + 0.1 * D], [0.3, 0.0], [0.05, 0.05], 1.0, disturbance=1)
+
+
+# ---- drawn from numbers of their own ---------------------------------------------------------------------------------
+
+
+def light_oscillator(rng: Random) -> Sketch:
+    """A swing with a damping of .001 to .3 of its rate, for up to eight periods; soft, hard or linear springs."""
+    w, count = log_uniform(rng, 0.5, 6.0), int(rng.choice([1, 2], p=[0.8, 0.2]))
+    soft, rows, speeds = float(rng.choice([0.0, 0.3, -0.3])), [], []
+    for i in range(count):
+        damping = log_uniform(rng, 1e-3, 0.3)
+        force = -(w**2) * x(i) - 2.0 * damping * w * x(count + i)
+        if soft:
+            force = force + soft * w**2 * (x(i) ** 3 if rng.random() < 0.5 else x(i) - sin(x(i)))
+        if count > 1:
+            force = force + 0.1 * w**2 * (x(1 - i) - x(i))
+        rows.append(force)
+        speeds.append(log_uniform(rng, 0.01, 0.1) * w**1.5)
+    center = [between(rng, -0.4, 0.4)] + [0.0] * (2 * count - 1)
+    horizon = float(f"{rng.uniform(1.0, 8.0) * 6.283 / w:.3g}")
+    return _flow([*(x(count + i) for i in range(count)), *rows], center, [0.0] * count + speeds, horizon)
+
+
+LATER["light_oscillator"] = light_oscillator
+
+DECIMALS = [(0.1, 0.2, 0.3), (0.3, 0.1, 0.2), (0.7, 0.1, 0.8), (0.1, 0.7, 0.8), (1.1, 2.2, 3.3), (0.25, 0.5, 0.75)]
+"""Sums that are equal as decimals; as floats the first is larger than the third, smaller, or equal to it."""
+
+
+def compared(rng: Random, horizon: float, continuous: bool) -> Formula:
+    """A comparison of constants, alone or beside the time, between two small numbers."""
+    a, b, c = DECIMALS[int(rng.integers(len(DECIMALS)))]
+    margin = number(a) + b - c if rng.random() < 0.5 else number(c) - a - b
+    yes, no = between(rng, -0.3, 0.3), between(rng, -0.3, 0.3)
+    roll = rng.random()
+    if roll < 0.4:
+        return apply("where", margin, yes, no)
+    at = between(rng, 0.2, 0.8) * horizon if continuous else float(rng.integers(0, int(horizon) + 1)) + 0.5
+    jump = apply("where", T - at, yes, no)
+    if roll < 0.7:
+        return jump
+    return jump + apply("where", (T + a) - (T + b) + (b - a) + float(rng.choice([-0.05, 0.05])), no, yes)

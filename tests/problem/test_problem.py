@@ -220,12 +220,17 @@ BOX = Box([0.5, -0.1], [0.7, 0.1])
         (BOX, Outside(HalfSpace([-1, 0], -0.65)), "a part of it"),
         (BOX, Outside(Box([0.65, -9], [9, 9])), "a part of it"),
         (BOX, Outside(Ellipsoid([0.6, 0], np.eye(2))), "its centre"),
-        (GaussianStart([2, 0], np.eye(2)), SQUARE, "the mean"),
+        (GaussianStart([2, 0], np.zeros((2, 2))), SQUARE, "the mean"),
     ],
 )
 def test_a_start_outside_the_safe_set_is_refused(start, constraint, fault):
     with pytest.raises(ValueError, match=f"`initial` must satisfy every constraint.* {fault}.* violates '"):
         problem(initial=start, safe=[constraint])
+
+
+def test_a_random_start_may_have_its_mean_where_paths_fail():
+    """How often it starts there is a part of the probability that is asked for."""
+    assert problem(initial=GaussianStart([2, 0], np.eye(2)), safe=[SQUARE]).initial.random
 
 
 def test_a_centre_that_is_undefined_at_the_start_is_refused_by_name():

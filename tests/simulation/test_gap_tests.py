@@ -6,6 +6,7 @@ from scipy.special import ndtr
 
 import certbound as cb
 from certbound.simulation.estimates.montecarlo import simulate_exits
+from certbound.simulation.estimates.splitting import simulate_rare_exits
 from certbound.simulation.gap_tests import barriers_of
 from certbound.simulation.stepping import Scenario
 from experiments.first_passage import exit_probability
@@ -218,3 +219,30 @@ def test_a_path_that_passes_an_obstacle_without_width_between_two_steps_has_fail
     for region, share in ((cb.Box([0.3], [0.3], coordinates=[0]), 1.0), (cb.Box([1.5], [1.5], coordinates=[0]), 0.0)):
         subject = cb.Problem(system, initial=[0.0, 0.0], safe=[cb.Outside(region)], horizon=1.0)
         assert simulate_exits(subject, paths=100, rng=1, steps=4).probability == share
+
+
+@pytest.mark.parametrize(("limit", "leaves"), [(0.999, True), (1.001, False)])
+@pytest.mark.parametrize("shape", ["box", "ball", "half-space"])
+def test_a_position_is_seen_where_it_turns_between_two_steps(limit, leaves, shape):
+    """x = sin t at steps of .3: the highest is .9975 (t = 1.5), and the parabola through three ends at 1.0000."""
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.0], [1e-9]])
+    safe = {
+        "box": cb.Inside(cb.Box([-2.0, -np.inf], [limit, np.inf])),
+        "ball": cb.Inside(cb.Ball([0.0], limit, coordinates=[0])),
+        "half-space": cb.Outside(cb.HalfSpace([-1.0, 0.0], -limit)),
+    }[shape]
+    subject = cb.Problem(system, initial=[0.0, 1.0], safe=[safe], horizon=3.0)
+    found = simulate_exits(subject, paths=4, rng=1, steps=10)
+    assert found.exits == (4 if leaves else 0)
+    rare = simulate_rare_exits(subject, paths=200, particles=20, rng=1, steps=10)
+    assert rare.probability == pytest.approx(1.0 if leaves else 0.0)
+    bare = simulate_exits(subject, paths=4, rng=1, steps=10, scenario=Scenario(bridge=False))
+    assert bare.exits == 0
+
+
+def test_a_position_is_not_looked_for_outside_of_a_window():
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.0], [1e-9]])
+    box = cb.Box([-2.0, -np.inf], [0.999, np.inf])
+    for during, exits in (((0.0, 1.5), 0), ((1.8, 3.0), 0), ((1.2, 1.8), 4)):
+        subject = cb.Problem(system, initial=[0.0, 1.0], safe=[cb.Inside(box, during=during)], horizon=3.0)
+        assert simulate_exits(subject, paths=4, rng=1, steps=10).exits == exits

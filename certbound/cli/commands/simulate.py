@@ -47,8 +47,8 @@ EXAMPLES = examples(
     "certbound simulate chain --paths 1e7 --checkpoint run.npz --against chain.json",
     "certbound simulate ou --paths 1e4 --rare",
 )
-FIRST = 2000
-COUNTED = ("paths", "exits", "probability", "lower", "upper", "confidence")
+FIRST = 500
+COUNTED = ("paths", "exits", "probability", "lower", "upper", "confidence", "refuted")
 SPENT = ("steps", "scheme", "path_steps_per_second", "seconds")
 
 PathsOption = Annotated[
@@ -95,7 +95,7 @@ def simulate(
     for doubt in {str(doubt.message) for doubt in doubts}:
         sys.stderr.write(f"certbound: {doubt}\n")
     if claim is not None:
-        contradicted = result["lower"] > 10.0**claim
+        contradicted = result["refuted"] > 10.0**claim
         result["against"] = {"certificate": str(against), "log10_delta": claim, "contradicted": contradicted}
     show(result, as_json, lambda: _print(result))
     raise typer.Exit(1 if claim is not None and result["against"]["contradicted"] else 0)
@@ -143,14 +143,19 @@ def _plain(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
     from certbound.simulation.estimates import simulate_exits
 
     found = simulate_exits(problem, **options)
-    return attributes(found, *COUNTED, "by_constraint", *SPENT)
+    return attributes(found, *COUNTED, "by_constraint", *SPENT) | _step(found.step)
 
 
 def _rare(problem: Problem, options: dict[str, Any]) -> dict[str, Any]:
     from certbound.simulation.estimates import simulate_rare_exits
 
     found = simulate_rare_exits(problem, **options)
-    return attributes(found, *COUNTED, "standard_error", "replicas", *SPENT)
+    return attributes(found, *COUNTED, "standard_error", "replicas", *SPENT) | _step(found.step)
+
+
+def _step(effect: Any) -> dict[str, Any]:
+    """What the step adds, with its limits, and the paths that say so; null in discrete time."""
+    return {"step": None if effect is None else attributes(effect, "adds", "lower", "upper", "paths")}
 
 
 def _claimed(path: Path) -> float:
@@ -197,12 +202,21 @@ def _progress_bar(paths: int) -> Iterator[Callable[[Progress], None] | None]:
         yield update
 
 
+def _added(result: dict[str, Any]) -> str:
+    """What the step adds to the probability, in words; nothing in discrete time."""
+    step = result["step"]
+    if step is None:
+        return ""
+    low, high = rounded(step["lower"], up=False, digits=2), rounded(step["upper"], up=True, digits=2)
+    return f"; the step adds about {step['adds']:.2g}, within [{low}, {high}]"
+
+
 def _print(result: dict[str, Any]) -> None:
     screen = console()
     low, high = result["lower"], result["upper"]
     least, most = rounded(low, up=False, digits=4), rounded(high, up=True, digits=4)
     sure = f"{100 * result['confidence']:g} %"
-    screen.print(f"exit probability {result['probability']:.4g}  ({sure} limits {least} ... {most})")
+    screen.print(f"exit probability {result['probability']:.4g}  ({sure} sampling [{least}, {most}]{_added(result)})")
     if SETTINGS.quiet:
         return
     steps = f"{result['steps']} steps of the {result['scheme']} scheme"
@@ -213,7 +227,12 @@ def _print(result: dict[str, Any]) -> None:
         screen.print(f"{result['exits']} of {result['paths']} paths left, {steps}")
     for label, count in result.get("by_constraint", {}).items():
         screen.print(f"  {count:>9}  {one_line(label)}", markup=False)
-    against = f"it refutes every bound below {least}" if low > 0 else "it refutes no bound"
+    refuted = result["refuted"]
+    against = f"it refutes every bound below {rounded(refuted, up=False, digits=4)}"
+    if refuted <= 0.0:
+        against = "it refutes no bound" + (", as half of the step does not" if low > 0.0 else "")
+    elif refuted < low:
+        against += ", with half of the step"
     screen.print(f"{against}, and supports none below {most}")
     if result.get("asked", result["paths"]) != result["paths"]:
         screen.print(f"the time was enough for {result['paths']} of {result['asked']} paths")

@@ -146,7 +146,9 @@ def _simulated(problem: Problem, left: float) -> str:
             from certbound.simulation.estimates import simulate_exits
 
             with Watch(min(left, _PATIENCE)).running():
-                found = simulate_exits(problem, paths=_PATHS, rng=0)
+                found = simulate_exits(problem, paths=_PATHS, rng=0, halve=False)
+                if found.refutes(problem.delta):  # only if half of the step says so too
+                    found = simulate_exits(problem, paths=_PATHS, rng=0)
     except (ArithmeticError, OutOfTime, SolverError, ValueError):
         return ""
     text = f"simulated, which proves nothing: {found.exits} of {found.paths} paths failed"

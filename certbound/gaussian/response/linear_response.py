@@ -147,7 +147,8 @@ def _noise_covariance(slope: Array, drift: Array, step: float, gram: Array) -> t
 
 
 def _propagate(
-    transition: Array, transition_error: Array, noise: Array, noise_error: Array, start: Array
+    transition: Array, transition_error: Array, noise: Array, noise_error: Array, start: Array,
+    start_error: Array | None = None,
 ) -> tuple[Array, Array]:
     """V_{k+1} = F V_k F^T + Q_k in floats, and W with |V_exact - V| <= W as quadratic forms."""
     cells, pieces, n, _ = transition.shape
@@ -155,6 +156,8 @@ def _propagate(
     w = np.zeros_like(v)
     v[:, 0] = start
     w[:, 0] = np.eye(n) * (2 * n * _UNIT * float(np.abs(start).max(initial=0.0)))
+    if start_error is not None:
+        w[:, 0] += np.diag(start_error.sum(axis=-1) * (1 + gamma(n)))
     eye = np.eye(n)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(pieces):
@@ -190,11 +193,12 @@ class Jumps:
 
 def continuous_response(
     slope: Array, drift: Array, step: float, diffusion: Array, start: Array, *, slope_error: float = 0.0,
-    jumps: Jumps | None = None,
+    jumps: Jumps | None = None, start_error: Array | None = None,
 ) -> LinearResponse:
     """Linear data in continuous time: dZ = (A + tau K) Z dt + g dW on every piece.
 
     ``diffusion`` is g (n, m), or one matrix a cell and piece, (B, N, n, m).
+    ``start_error`` bounds entrywise how far the start's covariance is from its floats, (n, n).
     ``slope_error`` bounds entrywise how far the exact slope (the model's constants) is from its floats.
     Where the slopes are too large for the series they run in units of the states in which the slopes are balanced, so
     that units cost no pieces of time; elsewhere bounds that are the same for all entries are best in the states' own.
@@ -215,7 +219,8 @@ def continuous_response(
         own = np.array(jumps.places)
         transition[:, own], error[:, own] = jumps.matrices / back, jumps.error / float(back.min())
         deviation[:, own] = 0.0
-    v, w = _propagate(transition, error, noise, noise_error, start / size)
+    v, w = _propagate(
+        transition, error, noise, noise_error, start / size, None if start_error is None else start_error / size)
     return LinearResponse(
         step=step, slope=slope, drift=drift, transition=transition * back, transition_error=error * float(back.max()),
         deviation=deviation * back + TINY, covariance=v * size, slope_error=slope_error,
@@ -251,13 +256,14 @@ def balanced(slopes: Array) -> Array:
 
 
 def discrete_response(
-    slope: Array, covariance: Array, covariance_bound: float, start: Array, *, slope_error: float = 0.0
+    slope: Array, covariance: Array, covariance_bound: float, start: Array, *, slope_error: float = 0.0,
+    start_error: Array | None = None,
 ) -> LinearResponse:
     """Linear data in discrete time: Z+ = A Z + w with Cov(w) (or its proxy) given up to an entrywise bound."""
     cells, steps = slope.shape[:2]
     noise = np.broadcast_to(covariance, slope.shape)
     none = np.full((cells, steps), slope_error)
-    v, w = _propagate(slope, none, noise, np.zeros_like(none) + covariance_bound, start)
+    v, w = _propagate(slope, none, noise, np.zeros_like(none) + covariance_bound, start, start_error)
     zero = np.zeros_like(slope)
     return LinearResponse(
         step=1.0, slope=slope, drift=zero, transition=slope, transition_error=none,

@@ -38,14 +38,22 @@ class Exceedances:
         tails = np.exp(log_tail_below(_standard(response, self)[1]))
         return np.asarray(np.maximum(tails * (1 - _ROUND) - self.lost, 0.0))
 
-    def union(self, response: LinearResponse) -> float:
-        """A lower bound of the probability that one of the events occurs, for the first cell of a response."""
+    def correlations(self, response: LinearResponse) -> Array:
+        """Upper bounds of the correlations between the events' rows, (M, M), whatever their levels; none below 0."""
+        return _correlations(response, self)
+
+    def union(self, response: LinearResponse, correlations: Array | None = None) -> float:
+        """A lower bound of the probability that one of the events occurs, for the first cell of a response.
+
+        ``correlations`` are those of `correlations`, where they are known.
+        """
         least = self.chances(response)
-        events, least = self.chosen(np.flatnonzero(least > 0)), least[least > 0]
+        likely = np.flatnonzero(least > 0)
+        events, least = self.chosen(likely), least[likely]
         if not len(least):
             return 0.0
         small, _ = _standard(response, events)
-        correlation = _correlations(response, events)
+        correlation = _correlations(response, events) if correlations is None else correlations[np.ix_(likely, likely)]
         first, second = np.triu_indices(len(least), 1)
         both = np.diag(np.exp(log_tail(small)))
         both[first, second] = np.exp(log_below_above(-small[first], small[second], -correlation[first, second]))

@@ -194,6 +194,11 @@ class GaussianStart:
         return len(self.mean)
 
     @property
+    def spread(self) -> bool:
+        """Whether it varies at all."""
+        return bool(np.any(self.covariance))
+
+    @property
     def middle(self) -> Array:
         """The mean."""
         return np.asarray(self.mean)

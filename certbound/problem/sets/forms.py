@@ -129,6 +129,8 @@ class Region:
     starts: ClassVar[bool] = True
     """Whether it may be an initial set."""
     random: ClassVar[bool] = False
+    spread: ClassVar[bool] = False
+    """Whether it is a random start, and not one point all the same."""
 
     @cached_property
     def form(self) -> Form:

@@ -20,6 +20,7 @@ _ROUNDING, _SLACK = 1e-12, 1e-9
 def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside], *, apart: bool = False) -> None:
     """Refuse a start that violates a constraint that is due at time 0, with a ValueError that names it.
 
+    A random start violates some with a probability, which counts: where its mean lies says nothing of that.
     ``apart``: with an InfeasibleError also one that may touch an obstacle then.
     """
     if apart:
@@ -35,7 +36,7 @@ def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside], 
                 f"`safe` must have centres that are defined when their sets count, but that of '{constraint.label}' is "
                 f"{place.tolist()} at time 0; mend the centre, or give the set a later `during`."
             )
-        fault = _fault(initial, center, constraint)
+        fault = "" if initial.spread else _fault(initial, center, constraint)
         if fault:
             raise ValueError(
                 f"`initial` must satisfy every constraint that is due at time 0, but {fault} violates "

@@ -29,6 +29,7 @@ class StartUnion:
     members: tuple[Region, ...]
 
     random: ClassVar[bool] = False
+    spread: ClassVar[bool] = False
     is_point: ClassVar[bool] = False
 
     @property

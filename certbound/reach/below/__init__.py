@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from certbound.reach.below.failing import least_failing
+from certbound.reach.below.failing import least_failing, least_failing_of
 
-__all__ = ["least_failing"]
+__all__ = ["least_failing", "least_failing_of"]

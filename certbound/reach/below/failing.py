@@ -34,6 +34,7 @@ from certbound.reach.below.breaches import Breach, breaches, events_of
 from certbound.reach.below.pushes import Pushed, plainly
 from certbound.reach.below.survival import Survival
 from certbound.reach.linear import FEWEST_PIECES, Linearisation, Share, depends_on_state, fitted
+from certbound.reach.nominal import Cells
 from certbound.reach.remainder import hidden_jump
 from certbound.watch import poll
 
@@ -79,7 +80,7 @@ class _Attempt:
 
     def proved(self) -> LeastFailing | None:
         run, problem = self.run, self.run.engine.problem
-        bounds = run.include(self.levels, 1) if run.curved else run.nothing
+        bounds = run.include(self.levels, 1)  # of a linear model too: its nominal is only followed in steps
         if bounds is None:
             return None
         probability, label, time = _least(run, self.found, bounds)
@@ -113,6 +114,20 @@ def least_failing(problem: Problem) -> LeastFailing | None:
             start = _farther(problem, single)
             best = best if start is None else _best(_single(problem, start), best)
     return best
+
+
+def least_failing_of(problem: Problem, cells: Cells) -> float:
+    """A lower bound of the probability of failing that holds from every start of a cell, under a constant disturbance.
+
+    Additive Gaussian noise, and what `least_failing` asks of the rest; 0 where nothing is found.
+    """
+    single = _single(problem, None)
+    with np.errstate(all="ignore"):
+        for attempt in _tried(single, Linearisation.of(single, cells=cells)):
+            found = attempt.proved()
+            if found is not None:
+                return found.probability
+    return 0.0
 
 
 def _best(single: Problem, best: LeastFailing | None) -> LeastFailing | None:

@@ -29,6 +29,7 @@ from certbound.reach.linear.hopes import (
 from certbound.reach.linear.proved import LinearAnswer
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
+from certbound.reach.nominal import Cells
 from certbound.reach.sets import ReachTube
 from certbound.watch import share_of_time
 
@@ -48,15 +49,15 @@ def refusal(problem: Problem) -> str | None:
 
 
 def linear_answer(
-    problem: Problem | HeldLoop, *, cells: int | None = None, thorough: bool = True, quick: bool = False,
+    problem: Problem | HeldLoop, *, cells: int | Cells | None = None, thorough: bool = True, quick: bool = False,
     before: LinearAnswer | None = None, found: Callable[[LinearAnswer], object] = nobody,
 ) -> LinearAnswer:
     """Bound the probability of leaving the safe set by the linear response (Thm K7').
 
     Parameters
     ----------
-    cells : int, optional
-        Cells along each side of the initial set; as few as serve when omitted.
+    cells : int or Cells, optional
+        Cells along each side of the initial set, as few as serve when omitted; or the cells themselves.
     thorough : bool
         False: one cell when omitted, but for a while in three states, or in fewer with ``before``; and no larger shares
         where nothing was proved.
@@ -68,7 +69,7 @@ def linear_answer(
         Takes each better answer on the way to the best one.
     """
     target = Share.of(problem.delta)
-    first = None if before is not None else _on_coarse_grids(problem, cells, target, found)
+    first = None if before is not None or isinstance(cells, Cells) else _on_coarse_grids(problem, cells, target, found)
     if first is not None and first.outcome.log_probability <= target.log:
         return first
     run = run_of(problem, cells=1 if cells is None else cells) if before is None else before.run

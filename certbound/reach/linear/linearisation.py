@@ -307,13 +307,14 @@ class Linearisation:
         start = self.start_covariance
         if isinstance(self.system, ContinuousSystem):
             return continuous_response(slope, drift, self.step, self.diffusion, start,
-                                       slope_error=self.slope_error)
+                                       slope_error=self.slope_error, start_error=self.split.start_error)
         g = np.asarray(self.system.noise_matrix, dtype=float)
         proxy = np.asarray(self.system.noise.proxy, dtype=float) * (1.0 if self.noise else 0.0)
         covariance = g @ proxy @ g.T
         covariance = (covariance + covariance.T) / 2
         bound = 8 * (len(proxy) + 2) * 2.0**-53 * float((np.abs(g) @ np.abs(proxy) @ np.abs(g).T).max(initial=0.0))
-        return discrete_response(slope, covariance, bound, start, slope_error=self.slope_error)
+        return discrete_response(
+            slope, covariance, bound, start, slope_error=self.slope_error, start_error=self.split.start_error)
 
     def step_events(self, cell: int) -> StepEvents:
         """Scalar events of one cell in discrete time."""
@@ -423,9 +424,10 @@ class Linearisation:
 
     def supports(self, cell: int, rows: Array, outputs: Integers | None = None) -> Supports:
         """Bounds of y and R of one cell along ``rows``; see `Supports`."""
-        radii = self.radii[cell]
+        radii, own = self.radii[cell], self.split.generators
+        generators = np.diag(radii)[radii > 0] if own is None else own[cell]
         return Supports(
-            self.response, self.gathering.of_cell(cell), cell, rows, np.diag(radii)[radii > 0],
+            self.response, self.gathering.of_cell(cell), cell, rows, generators,
             continuous=self.continuous, outputs=outputs,
         )
 

@@ -23,10 +23,14 @@ class Cells:
     """Boxes (B, n) whose union contains the initial set, and a float point of each.
 
     ``round`` is the initial set itself, when it is one cell and a ball or an ellipsoid: its centre and its form.
+    ``generators`` (B, G, n) are cells that are zonotopes about their centres, each within its box; the deviation of a
+    random start may then begin with a covariance that is off its floats by ``start_error`` (n, n), entry by entry.
     """
 
     centres: Array
     boxes: Interval
+    generators: Array | None = None
+    start_error: Array | None = None
     round: tuple[Array, Quadratic] | None = None
 
     def radii(self, norm: Norm, starts: Interval) -> Array:

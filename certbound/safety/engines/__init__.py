@@ -10,7 +10,7 @@ from certbound.safety.engines.linear import linear_below, linear_engine
 from certbound.safety.engines.linear_sketch import linear_chance
 from certbound.safety.engines.oblique_limits import Apart, Logarithmic, Turned, by_logarithms, in_coordinates
 from certbound.safety.engines.quadratic import quadratic_engine
-from certbound.safety.engines.random_starts import prove_truncated
+from certbound.safety.engines.random_starts import prove_truncated, starts_engine
 from certbound.safety.engines.rooms import joined, log10_sum
 from certbound.safety.engines.values import values_engine
 
@@ -32,6 +32,7 @@ __all__ = [
     "Logarithmic",
     "prove_truncated",
     "quadratic_engine",
+    "starts_engine",
     "Turned",
     "values_engine",
 ]

@@ -43,6 +43,7 @@ _SCALE = _RIGHT[:256] * 2.0**-52
 _INNER = np.floor(_RIGHT[1:] / _RIGHT[:256] * 2.0**52).astype(np.int64)
 
 _ONE, _BYTE, _TOP = uint64(1), uint64(255), uint64(1 << 63)
+_GOLDEN = uint64(0x9E3779B97F4A7C15)  # 2**64 over the golden ratio, odd
 _S3, _S11, _S24, _S40 = uint64(3), uint64(11), uint64(24), uint64(40)
 
 
@@ -61,6 +62,18 @@ def seed_stream(entropy: int, block: int) -> NDArray[np.uint64]:
     """
     words = [np.random.SFC64(np.random.SeedSequence(entropy, spawn_key=(block, key))).state for key in (1, 2)]
     return np.array([word for state in words for word in cast(Any, state)["state"]["state"]], dtype=np.uint64)
+
+
+def _stream_of(stream, path):  # type: ignore[no-untyped-def]
+    """Four words of a stream of its own for the noise of a path, made from the block's and mixed as SFC64 mixes a seed.
+
+    Paths of two simulations then meet the same noise, wherever the paths before them have ended.
+    """
+    a, b, c, w = stream[4], stream[5] ^ stream[7], stream[6] + _GOLDEN * uint64(path + 1), _ONE
+    for _ in range(12):
+        word = a + b + w
+        a, b, c, w = b ^ (b >> _S11), c + (c << _S3), ((c << _S24) | (c >> _S40)) + word, w + _ONE
+    return a, b, c, w
 
 
 def _next_word(stream):  # type: ignore[no-untyped-def]
@@ -119,6 +132,7 @@ def _normal_slowly(layer, position, a, b, c, w):  # type: ignore[no-untyped-def]
 
 _slowly = inner(_normal_slowly)
 draw_normal = inner(_draw_normal)
+stream_of = inner(_stream_of)
 
 
 def _draw_uniform(a, b, c, w):  # type: ignore[no-untyped-def]

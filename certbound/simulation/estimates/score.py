@@ -3,13 +3,14 @@
 The score of a constraint is 1 - gap/(gap of the noise-free path): 0 on the noise-free path, 1 on the
 boundary. A path's score is the largest over constraints and time, so that it leaves exactly when its score
 reaches 1. Between two steps the smallest gap of a Brownian bridge is drawn where it can raise the record, as
-in `barriers`. Outside its window a constraint guides the splitting too, with a score that stays below 1."""
+in `gap_tests`, or that of a smooth gap is found. Outside its window a constraint guides the splitting too, with a
+score that stays below 1."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, if_all, starts_at_once, window_test
+from certbound.simulation.gap_tests import EXPONENT, Barrier, Bridge, if_all, starts_at_once, turns, window_test
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 
 _ALMOST = 1.0 - 1e-9  # score of a path beyond a constraint that does not hold yet
@@ -38,6 +39,11 @@ def score_source(
         bridged = " and ".join(window_test(number, barrier, "k"))
         for unit in range(units):
             spread = _spread(barrier, unit, column, bridge, p) if bridge else ([], "0.0")
+            older, rows = f"o_{number}_{unit}", barrier.matrix[unit : unit + 1] if units > 1 else barrier.matrix
+            if bridge is not None and bridge.smooth(rows):
+                spread = _turn(older, old[unit], new[unit], window_test(number, barrier, "k - 1")), "0.0"
+                begin += [f"{older} = math.nan"]
+                end += [f"{older} = {old[unit]}"]
             within += _unit((old[unit], new[unit], free[unit]), (active, bridged), *spread, p)
         end += [f"{g} = {n}" for g, n in zip(old, new)]
         column += len(barrier.matrix) if barrier.moving else 0
@@ -58,6 +64,8 @@ def _unit(
             f"    low = fall_between(stream, {g}, {n}, floor, {spread}, low)",
         ]
         lines += [if_all(f"{free} > 0.0", bridged), *indent(draw)]
+    else:
+        lines += spread_lines
     lines += [
         f"if {free} > 0.0:",
         f"    if low < (1.0 - top) * {free}:",
@@ -67,6 +75,12 @@ def _unit(
         "    top = max(top, 2.0)",
     ]
     return lines
+
+
+def _turn(older: str, old: str, new: str, active: list[str]) -> list[str]:
+    """Lines that lower the least gap to that of the parabola through three gaps, where it is least between them."""
+    least = f"{old} - ({new} - {older}) ** 2 / (8.0 * ({older} - {old} + {new} - {old}))"
+    return [if_all(turns(older, old, new), *active), f"    low = min(low, {least})"]
 
 
 def _gaps(barrier: Barrier, targets: list[str], state: str, step: str, column: int, p: Parameters) -> list[str]:

@@ -13,13 +13,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from certbound.arrays import Array
 from certbound.simulation.blocks import MEMORY_LIMIT, Tally, Work, check_count
 from certbound.simulation.checkpoint import seed_of
+from certbound.simulation.estimates.halving import OTHER, StepEffect, checkpoint_beside, halved
 from certbound.simulation.estimates.preparation import Setting, prepare, refuse_held
 from certbound.simulation.estimates.score import score_source
 from certbound.simulation.estimates.statistics import bound_binomial, check_confidence
@@ -57,12 +58,18 @@ class RareExits:
     paths: int  # particles in all replicas
     exits: int  # particles that had left in the end, in all replicas
     replicas: int
+    step: StepEffect | None  # what the step adds, from independent replicas with half of it; None in discrete time
     steps: int
     scheme: str
     path_steps: int  # path-steps done, copies included
     # compilation left out
     seconds: float
     path_steps_per_second: float
+
+    @property
+    def refuted(self) -> float:
+        """The bound below which all are refuted: by the limit with the step, and by that with half of it."""
+        return self.lower if self.step is None else min(self.lower, self.step.halved_lower)
 
 
 def simulate_rare_exits(
@@ -73,6 +80,7 @@ def simulate_rare_exits(
     rng: np.random.Generator | int | None = None,
     steps: int | None = None,
     confidence: float = 0.99,
+    halve: bool = True,
     executor: Any = None,
     checkpoint: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
@@ -87,7 +95,12 @@ def simulate_rare_exits(
         Particles in all; ``paths // particles`` independent replicas run, at least ten.
     particles : int
         Particles per replica, at least 20.
-    rng, steps, confidence, executor, checkpoint, progress, scenario
+    rng, steps, confidence
+        As in `certbound.simulate_exits`.
+    halve : bool
+        Run half as many replicas of half as many particles with half of the step too, on noise of their own: copies of
+        particles cannot share it. Not in discrete time.
+    executor, checkpoint, progress, scenario
         As in `certbound.simulate_exits`; a switching disturbance is refused.
 
     Returns
@@ -121,24 +134,17 @@ def simulate_rare_exits(
         raise ValueError("`problem` must count leaving its domain as failing here; use simulate_exits.")
     if problem.reach is not None:
         raise ValueError("`problem` must have no target for rare exits; count plain paths, simulate_exits.")
-    own = not setting.shared_nominal
-    _check_memory(setting, particles, own)
-    barriers = barriers_of(problem, setting.times)
-    work = setting.work(
-        _kernel_source(model, barriers, own),
-        RareWork,
-        nominal=setting.nominal(),
-        **tables_of(barriers),
-        profile=np.array([_DISCARDED]),
-        marks=np.ones(1 if own else 0, dtype=np.int64),
-        counts_shape=(replicas, 2),
-        paths=replicas * particles,
-        block=particles,
-        entropy=seed_of(rng, checkpoint),
-    )
+    _check_memory(setting, particles)
+    work = _rare_work(problem, setting, particles, replicas, seed_of(rng, checkpoint))
     outcome = run_work(work, executor, checkpoint, progress)
-    estimates = outcome.tally.counts[:, 0].copy().view(np.float64)
-    probability, error, lower, upper = _summary(estimates, replicas * particles, confidence)
+    probability, error, lower, upper = _summary(_estimates(outcome.tally), replicas * particles, confidence)
+    step, seconds = None, outcome.seconds
+    if halve and model.scheme != "discrete":
+        fine, few = halved(problem, setting, scenario), max(particles // 2, 10)
+        half = _rare_work(problem, fine, few, max(replicas // 2, 10), work.entropy ^ OTHER)
+        other = run_work(half, executor, checkpoint_beside(checkpoint))
+        step = _step_effect(_estimates(outcome.tally), _estimates(other.tally), few, confidence)
+        seconds += other.seconds
     return RareExits(
         probability=probability,
         standard_error=error,
@@ -148,18 +154,55 @@ def simulate_rare_exits(
         paths=replicas * particles,
         exits=int(outcome.tally.counts[:, 1].sum()),
         replicas=replicas,
+        step=step,
         steps=setting.steps,
         scheme=model.scheme,
         path_steps=outcome.tally.steps,
-        seconds=outcome.seconds,
+        seconds=seconds,
         path_steps_per_second=outcome.rate,
     )
 
 
-def _check_memory(setting: Setting, particles: int, own: bool) -> None:
-    """Refuse more particles than their stored paths may take; ``own`` noise-free paths are stored too."""
+def _rare_work(problem: Any, setting: Setting, particles: int, replicas: int, entropy: int) -> RareWork:
+    own = not setting.shared_nominal
+    barriers = barriers_of(problem, setting.times)
+    work = setting.work(
+        _kernel_source(setting.model, barriers, own),
+        RareWork,
+        nominal=setting.nominal(),
+        **tables_of(barriers),
+        profile=np.array([_DISCARDED]),
+        marks=np.ones(1 if own else 0, dtype=np.int64),
+        counts_shape=(replicas, 2),
+        paths=replicas * particles,
+        block=particles,
+        entropy=entropy,
+    )
+    return cast(RareWork, work)
+
+
+def _estimates(tally: Tally) -> Array:
+    """The replicas' estimates."""
+    return np.asarray(tally.counts[:, 0].copy().view(np.float64))
+
+
+def _step_effect(coarse: Array, fine: Array, particles: int, confidence: float) -> StepEffect:
+    """The difference of two means of replicas, with Student limits of the fewer ones (approximate)."""
+    from scipy.special import stdtrit
+
+    paths = len(fine) * particles
+    (first, above, *_), (second, below, low, _) = (
+        _summary(estimates, paths, confidence) for estimates in (coarse, fine)
+    )
+    width = float(stdtrit(len(fine) - 1, 0.5 * (1.0 + confidence))) * math.hypot(above, below)
+    adds = first - second
+    return StepEffect(adds=adds, lower=adds - width, upper=adds + width, halved_lower=low, paths=paths)
+
+
+def _check_memory(setting: Setting, particles: int) -> None:
+    """Refuse more particles than their stored paths may take; noise-free paths of their own are stored too."""
     n = setting.model.dimension
-    size = 8 * (setting.steps + 1) * (1 + n * (2 if own else 1))
+    size = 8 * (setting.steps + 1) * (1 + n * (1 if setting.shared_nominal else 2))
     if particles * size > MEMORY_LIMIT // 4:
         raise ValueError(
             f"`particles` must be at most {MEMORY_LIMIT // 4 // size} with {setting.steps} steps of {n} "
@@ -215,7 +258,7 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
     """Source of the splitting kernel, which runs one particle on from a step; see `compiled.particles`."""
     p = start_text(model)
     functions = function_lines(model, p)
-    step, bridge = step_lines(model, p)
+    step, bridge = step_lines(model, p, "first")
     begin, within, end = score_source(barriers, bridge, p)
     n = model.dimension
     load = [*load_lines(model, "states[path, first, {0}]", p), "top = tops[path, first]"]
@@ -223,7 +266,7 @@ def _kernel_source(model: StepModel, barriers: list[Barrier], own: bool) -> tupl
     store = [*each("states[path, k + 1, {0}] = y_{0}", n, p), "tops[path, k + 1] = top"]
     if own:
         load += each("a_{0} = frees[path, first, {0}]", n, p)
-        free = nominal_lines(model, p)
+        free = nominal_lines(model, p, "first")
         store += each("frees[path, k + 1, {0}] = b_{0}", n, p)
         end = [*end, *each("a_{0} = b_{0}", n, p)]
     full = ["hold(tops, path, k + 1, top)", "break"]

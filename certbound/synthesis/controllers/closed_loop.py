@@ -94,7 +94,7 @@ def simulate_closed_loop(
             violations += int(broken.sum())
         done += count
     if continuous:
-        exits = simulate_exits(problem, paths=int(runs), rng=generator)
+        exits = simulate_exits(problem, paths=int(runs), rng=generator, halve=False)
         violations, counts = exits.exits, dict(exits.by_constraint)
     lower, upper = bound_binomial(violations, int(runs), CONFIDENCE)
     mean = total / runs

@@ -7,7 +7,8 @@ import pytest
 from certbound.cli.app import run
 
 KEYS = {
-    "paths", "exits", "probability", "lower", "upper", "confidence", "path_steps_per_second", "seconds",
+    "paths", "exits", "probability", "lower", "upper", "confidence", "path_steps_per_second", "seconds", "step",
+    "refuted",
 }  # fmt: skip
 
 
@@ -58,9 +59,32 @@ def test_text_for_people_tells_what_is_refuted(capsys):
     assert run(["simulate", "ou", "--paths", "2000", "--seed", "1", "--set", "radius=0.8"]) == 0
     text = capsys.readouterr().out
     assert "exit probability" in text
+    assert "(99 % sampling [0." in text
+    assert "]; the step adds about " in text
     assert "of 2000 paths left, 1000 steps of the exact scheme" in text
     assert "it refutes every bound below 0." in text
     assert ", and supports none below 0." in text
+
+
+def test_what_only_one_step_refutes_is_not_refuted(capsys, monkeypatch):
+    from certbound.simulation.estimates import montecarlo
+
+    def coarse_alone(counts, exits, pairs, confidence, known=montecarlo.step_effect):
+        return known([0, pairs // 10, 0], (exits[0] // 100, exits[1]), pairs, confidence)
+
+    monkeypatch.setattr(montecarlo, "step_effect", coarse_alone)
+    words = ("ou", "--paths", "2000", "--seed", "1", "--set", "radius=0.8")
+    found = answer(capsys, *words)
+    assert found["lower"] > 0.0 == found["refuted"]
+    assert found["step"]["adds"] == 0.1
+    assert run(["simulate", *words]) == 0
+    assert "it refutes no bound, as half of the step does not, and supports" in capsys.readouterr().out
+
+
+def test_discrete_time_has_no_step(capsys):
+    assert answer(capsys, "chain", "--paths", "100", "--seed", "1")["step"] is None
+    assert run(["simulate", "chain", "--paths", "100", "--seed", "1"]) == 0
+    assert "the step adds" not in capsys.readouterr().out
 
 
 def test_without_an_exit_no_bound_is_refuted(capsys):

@@ -187,3 +187,16 @@ def test_windows_between_the_times_of_a_grid_hide_nothing():
     assert both.probability > 0.02
     never = cb.Inside(cb.Box([-0.3, -np.inf], [0.3, np.inf]), during=(0.4997, 0.49971))
     assert least_failing(curved([never], horizon=1.0)) is None
+
+
+def test_a_linear_model_is_followed_in_steps_whose_error_is_taken_off() -> None:
+    """A turning mean that ends 1e-4 beside where the steps say: nearly every path was said to fail, and none does."""
+    system = cb.ContinuousSystem(lambda x, y: [2 * y, -2 * x], states=["x", "y"], diffusion=1e-6 * np.eye(2))
+    end, followed = math.cos(40.0), -0.66683076752
+    limit = (end + followed) / 2
+    safe = [cb.Inside(cb.HalfSpace([1.0, 0.0], limit), during=(20.0, 20.0))]
+    problem = cb.Problem(system, initial=[1.0, 0.0], safe=safe, horizon=20.0)
+    found = least_failing(problem)
+    truth = norm.sf((limit - end) / (1e-6 * math.sqrt(20.0)))
+    assert truth < 1e-20
+    assert found is None or found.probability <= truth

@@ -126,7 +126,7 @@ def test_other_steps_than_the_horizon_are_refused_in_discrete_time():
 def test_a_model_that_returns_nan_is_reported_with_state_time_and_path():
     system = cb.ContinuousSystem(lambda x: [np.sqrt(1.0 - x[0]), 0.0], states=2, diffusion=[[0.0], [0.1]])
     subject = cb.Problem(system, initial=[0.5, 0.0], safe=[], domain=cb.Box([-9, -9], [9, 9]), horizon=5.0)
-    with pytest.raises(ValueError, match=r"not finite in the step after time 1.3 on path 0, from state \(1.0"):
+    with pytest.raises(ValueError, match=r"not finite in the step after time 1.4 on path 0, from state \(0.99"):
         simulate_exits(subject, paths=3000, rng=0, steps=100)
 
 

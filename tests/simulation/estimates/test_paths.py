@@ -209,8 +209,9 @@ def test_the_deviation_is_the_difference_to_the_path_without_noise():
         lambda x, d: -np.sin(x) + d, states=1, disturbance=cb.Box([-1.0], [1.0]), diffusion=[[0.3]]
     )
     subject = problem(system, cb.Box([0.0], [1.0]))
-    states = sample_paths(subject, paths=50, rng=11, steps=40)
-    deviations = sample_paths(subject, paths=50, rng=11, steps=40, deviation=True)
+    euler = Scenario(scheme="euler")
+    states = sample_paths(subject, paths=50, rng=11, steps=40, scenario=euler)
+    deviations = sample_paths(subject, paths=50, rng=11, steps=40, deviation=True, scenario=euler)
     nominal = (states - deviations)[..., 0]
     rates = np.diff(nominal, axis=1) * 40 + np.sin(nominal[:, :-1])  # the constant disturbance of each path
     assert np.max(np.ptp(rates, axis=1)) < 1e-9
