@@ -52,7 +52,7 @@ tubes.exact
 tubes
 values
 values.continuous values.discrete
-values.backward
+values.kolmogorov
 values.semilagrangian values.chains values.directed
 simulation.compiled
 simulation
@@ -145,7 +145,7 @@ MANY_DOORS = {
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (9, "to and from each library"),
     "safety.certificates": (7, "a writer an engine, one for each side where it has two, and one of other coordinates"),
-    "safety.engines": (19, "the engines, and the rooms that their certificates restate"),
+    "safety.engines": (20, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),
 }

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 import certbound as cb
 from certbound.problem.model import compile_numpy
-from certbound.values.continuous.coefficients import squared_diffusion
+from certbound.values.enclosing import squared_diffusion
 
 _GAMMA = 1 - 0.5**0.5
 

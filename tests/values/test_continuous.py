@@ -17,7 +17,7 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model.tracing import trace
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous import exits, hypotheses, payment
-from certbound.values.continuous.coefficients import Cells, Reader, enclose, squared_diffusion
+from certbound.values.continuous.coefficients import Cells, Reader
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, extreme_over, prove_lower, prove_upper
 from certbound.values.continuous.line import ladder
@@ -28,7 +28,11 @@ from certbound.values.continuous.plane.plane_below import bound_plane_below, pla
 from certbound.values.continuous.plane.plane_grids import Plan, Source
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.plane.solver import weakened
-from certbound.values.continuous.polynomials import (
+from certbound.values.continuous.proposal import Splines, through
+from certbound.values.continuous.residual import bound_ranges
+from certbound.values.continuous.surface import Surface
+from certbound.values.enclosing import enclose, squared_diffusion
+from certbound.values.polynomials import (
     CUBIC_HERMITE,
     HERMITE,
     basis_at,
@@ -37,10 +41,7 @@ from certbound.values.continuous.polynomials import (
     nodes_of,
     to_bernstein,
 )  # fmt: skip
-from certbound.values.continuous.proposal import Splines, through
-from certbound.values.continuous.residual import bound_ranges
-from certbound.values.continuous.room import safe_room, starts_of
-from certbound.values.continuous.surface import Surface
+from certbound.values.room import safe_room, starts_of
 
 
 def exit_probability(f, g, low, high, horizon, start, *, cells=400, steps=200):

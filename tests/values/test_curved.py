@@ -24,9 +24,9 @@ from certbound.values.continuous.curved.region import region_of
 from certbound.values.continuous.hypotheses import Need, Proof, up
 from certbound.values.continuous.plane import Plan, floats_of, plane_of
 from certbound.values.continuous.residual import Ranges
-from certbound.values.continuous.room import starts_of
 from certbound.values.continuous.straight import SMALL
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import starts_of
 from tests.values.random_problems import check
 from tests.values.test_continuous import hermite_values, random_surface, read, spoilt
 

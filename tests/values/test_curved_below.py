@@ -20,8 +20,8 @@ from certbound.values.continuous.curved.region import region_of
 from certbound.values.continuous.hypotheses import Need, Proof
 from certbound.values.continuous.plane import Plane, floats_of, plane_of
 from certbound.values.continuous.residual import Ranges
-from certbound.values.continuous.room import starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import starts_of
 from tests.values.test_continuous import hermite_values, read, spoilt
 from tests.values.test_curved import REGIONS, cut_up, in_disc, leaving_a_disc, satisfied
 

@@ -12,11 +12,11 @@ import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.rigor.intervals import Interval
 from certbound.values.continuous import bound_exits, exits, is_confined, proposal
-from certbound.values.continuous.coefficients import enclose
 from certbound.values.continuous.held_faces import held_face, rarely_reached, resolved
 from certbound.values.continuous.payment import Payment, Terms
 from certbound.values.continuous.plane import held_plane, plane_of, released, two_sides
 from certbound.values.continuous.plane.two_sides import with_rare
+from certbound.values.enclosing import enclose
 
 
 def line(f, g, safe, *, start=0.5, horizon=2.0, states=("x",)):

@@ -18,8 +18,8 @@ from certbound.values.continuous.plane import two_sides
 from certbound.values.continuous.plane.monotone import propose_monotone
 from certbound.values.continuous.plane.plane_grids import Plan, Plane
 from certbound.values.continuous.plane.plane_proposal import propose_plane
-from certbound.values.continuous.room import safe_room, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import safe_room, starts_of
 
 
 def seen(problem: cb.Problem) -> tuple[Model, Plane]:

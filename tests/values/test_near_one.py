@@ -28,9 +28,9 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.plane import Plane, plane_of
 from certbound.values.continuous.residual import bound_ranges, sample_in_plane
-from certbound.values.continuous.room import safe_room, starts_of
 from certbound.values.continuous.straight import near_one, ramps, relative
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
+from certbound.values.room import safe_room, starts_of
 from certbound.watch import OutOfTime
 
 

@@ -14,8 +14,8 @@ from certbound.values.continuous.plane import Source, integrated, plan_above, pl
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.rare import rare_above
 from certbound.values.continuous.residual import Ranges
-from certbound.values.continuous.room import safe_room, starts_of
 from certbound.values.continuous.straight import near_one
+from certbound.values.room import safe_room, starts_of
 
 
 def turning(noise: float) -> cb.Problem:

@@ -13,7 +13,7 @@ import pytest
 import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.problem.model.tracing import trace
-from certbound.values.continuous.coefficients import Reader, squared_diffusion
+from certbound.values.continuous.coefficients import Reader
 from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import Model, interpolants, sampled
 from certbound.values.continuous.plane import Plan, integrated
@@ -22,6 +22,7 @@ from certbound.values.continuous.space import space_bounds
 from certbound.values.continuous.space.space_box import closed_room
 from certbound.values.continuous.space.space_solver import SpaceSolver
 from certbound.values.continuous.surface import Surface
+from certbound.values.enclosing import squared_diffusion
 
 NAMES = ("x", "y", "z")
 GAIN = np.array([[0.5, 0.0, 0.0], [0.2, 0.4, 0.0], [0.0, -0.1, 0.6]])

@@ -12,8 +12,8 @@ from certbound.values.continuous.exits import bound_exits
 from certbound.values.continuous.hypotheses import extreme_over
 from certbound.values.continuous.line.initial_law import Start
 from certbound.values.continuous.plane import two_sides
-from certbound.values.continuous.room import points_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import points_of
 
 
 def random_surface(rng: np.random.Generator, n: int) -> Surface:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from certbound.safety.engines.backward import backward_engine
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
@@ -12,7 +11,7 @@ from certbound.safety.engines.oblique_limits import Apart, Logarithmic, Turned, 
 from certbound.safety.engines.quadratic import quadratic_engine
 from certbound.safety.engines.random_starts import prove_truncated, starts_engine
 from certbound.safety.engines.rooms import joined, log10_sum
-from certbound.safety.engines.values import values_engine
+from certbound.safety.engines.values import backward_engine, values_engine
 
 __all__ = [
     "Apart",

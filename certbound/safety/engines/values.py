@@ -1,9 +1,10 @@
-"""The engine of value functions (Thm K8): the probability of failing itself, from both sides, for few states."""
+"""The engines of value functions (Thms K8, K10): the probability of failing itself, from both sides, for few states."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
@@ -31,6 +32,8 @@ _SPACE = 120.0  # the same for three states in continuous time
 _GRANT = 0.7  # of the time that is left, where all of it may be spent: what does not come to its end is lost
 _LEAST = 1e-3
 _FLOOR = -300.0
+_BACKWARD = 30.0  # of work, where it is asked alone
+_BRIEF = 0.2  # of that, where it is asked among others
 _RATIO, _RATIO_WITH_EFFORT = 1.05, 1.0001  # of the two bounds below which grids are not refined
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
@@ -250,3 +253,39 @@ def log10_outward(probability: float, *, up: bool) -> float:
     value = math.log10(max(probability, 10.0**_FLOOR))
     slack = 1e-14 * abs(value) + 1e-15
     return min(value + slack, 0.0) if up else min(value - slack, 0.0)
+
+
+def backward_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+    """Certified bounds of the probability of failing, on finer and finer grids; nothing where another has answered.
+
+    Proves: log10_lower <= log10 of the largest probability of failing over starts <= log10_delta.
+    """
+    if asked.quick:
+        return EngineAnswer(applicable=False, method="backward", reason=SPARED)
+    from certbound.values.kolmogorov import bound_failing
+
+    effort = asked.effort if asked.effort is not None else 1.0 if asked.thorough else _BRIEF
+    answer = EngineAnswer(applicable=False, method="backward")
+    try:
+        for found in bound_failing(problem, seconds=effort * _BACKWARD, delta=problem.delta):
+            answer = _carried(problem, found)
+            asked.found(answer)
+    except (InfeasibleError, EnclosureError) as error:
+        return EngineAnswer(applicable=False, method="backward", reason=str(error))
+    return replace(answer, effort=effort)
+
+
+def _carried(problem: Problem, found: Any) -> EngineAnswer:
+    cells = " x ".join(str(count) for count in found.cells)
+    least, most = rounded(found.lower, up=False, digits=4), rounded(found.upper, up=True, digits=4)
+    below = f" and at least {least}" if found.lower > 0 else ""
+    how = f"by a solution on {cells} cells whose error is carried"
+    reason = f"the probability of failing is at most {most}{below}, {how}"
+    if found.lower > problem.delta:
+        reason += f": more than the {problem.delta!r} that is asked, from some start"
+    return EngineAnswer(
+        log10_delta=log10_outward(found.upper, up=True),
+        log10_lower=log10_outward(found.lower, up=False) if found.lower > 0 else None,
+        reason=f"{reason}.", method="backward", details=found,
+        conclusive=found.upper <= _CLOSE * found.lower,
+    )  # fmt: skip

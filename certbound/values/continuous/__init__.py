@@ -14,8 +14,8 @@ from certbound.values.continuous.line import (
     leaves_surely,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.room import faces_of, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import faces_of, starts_of
 
 __all__ = [
     "ExitBounds", "Lasting", "Payment", "Rate", "SureExit", "Surface", "bound_exits", "bound_lasting",

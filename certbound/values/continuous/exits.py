@@ -20,7 +20,7 @@ from certbound.problem.sets import Box
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
 from certbound.values.charts import Charts
-from certbound.values.continuous.coefficients import Reader, squared_diffusion
+from certbound.values.continuous.coefficients import Reader
 from certbound.values.continuous.curved import bound_region, boxed, walled
 from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import Model
@@ -34,8 +34,9 @@ from certbound.values.continuous.plane import (
     two_states,
     windowed,
 )  # fmt: skip
-from certbound.values.continuous.room import limits_of, safe_room
 from certbound.values.continuous.surface import Surface
+from certbound.values.enclosing import squared_diffusion
+from certbound.values.room import limits_of, safe_room
 from certbound.values.sets import as_stays
 
 Proposed = tuple[Surface | tuple[Surface, ...], Payment]

@@ -42,8 +42,9 @@ from certbound.arrays import Array, Mask
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model import JUMPS, Graph, Tape, compile_numpy, enclosed, jacobian
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.coefficients import Reader, enclose
+from certbound.values.continuous.coefficients import Reader
 from certbound.values.continuous.hypotheses import Model, Sides
+from certbound.values.enclosing import enclose
 
 Ends = tuple[float, float]
 

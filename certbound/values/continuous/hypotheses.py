@@ -29,7 +29,6 @@ from certbound.rigor.intervals import Interval
 from certbound.values.charts import Chart, from_natural
 from certbound.values.continuous.coefficients import Cells, Interpolant, Reader
 from certbound.values.continuous.payment import Patched, Payment, bound_above, bound_below, pay_lower, pay_upper
-from certbound.values.continuous.polynomials import nodes_of
 from certbound.values.continuous.residual import (
     Ranges,
     bound_ranges,
@@ -39,6 +38,7 @@ from certbound.values.continuous.residual import (
     value_range,
 )  # fmt: skip
 from certbound.values.continuous.surface import Surface
+from certbound.values.polynomials import nodes_of
 
 Found = TypeVar("Found")
 Near = tuple[float, float, float] | None

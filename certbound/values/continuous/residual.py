@@ -26,7 +26,7 @@ import numpy as np
 from certbound.arrays import Array, Index
 from certbound.rigor.rounding import UNIT
 from certbound.values.continuous.coefficients import Interpolant
-from certbound.values.continuous.polynomials import basis_at, lebesgue, nodes_of, norm, to_bernstein, to_parts
+from certbound.values.polynomials import basis_at, lebesgue, nodes_of, norm, to_bernstein, to_parts
 
 SPACE, TIME = 5, 3
 CUBIC = 3  # in each of three states

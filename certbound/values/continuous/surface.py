@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.continuous.polynomials import CUBIC_HERMITE, HERMITE, QUARTERS
 from certbound.values.continuous.residual import Patches, along, value_range
+from certbound.values.polynomials import CUBIC_HERMITE, HERMITE, QUARTERS
 from certbound.watch import poll
 
 _MANY = 4000  # cells that are looked at together in three states

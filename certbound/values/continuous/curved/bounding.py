@@ -39,8 +39,8 @@ from certbound.values.continuous.plane import (
     slab_times,
 )
 from certbound.values.continuous.residual import sample_in_plane, value_range
-from certbound.values.continuous.room import limits_of, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import limits_of, starts_of
 from certbound.watch import OutOfTime
 
 if TYPE_CHECKING:

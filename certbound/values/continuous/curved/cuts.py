@@ -15,9 +15,9 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous.coefficients import Cells, Interpolant
 from certbound.values.continuous.curved.boundaries import Wall, Walls
 from certbound.values.continuous.hypotheses import Model
-from certbound.values.continuous.polynomials import QUARTERS, nodes_of
 from certbound.values.continuous.residual import Patches
 from certbound.values.continuous.surface import Surface
+from certbound.values.polynomials import QUARTERS, nodes_of
 
 PARTS = 4
 Ends = tuple[tuple[Interval, Interval], ...]

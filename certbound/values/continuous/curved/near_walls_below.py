@@ -24,9 +24,9 @@ from certbound.values.continuous.held_faces import check_noise
 from certbound.values.continuous.hypotheses import NEGLIGIBLE, Model, Proof, covers
 from certbound.values.continuous.plane import Plane, Source
 from certbound.values.continuous.residual import Ranges, sample_in_plane, value_range
-from certbound.values.continuous.room import points_of
 from certbound.values.continuous.straight import relative_below
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import points_of
 from certbound.watch import OutOfTime
 
 _SAMPLES = (4, 6, 6)

@@ -37,9 +37,9 @@ from certbound.values.continuous.hypotheses import (
     up,
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
-from certbound.values.continuous.polynomials import QUARTERS
 from certbound.values.continuous.residual import Patches, Ranges, bound_ranges, coarse_size, value_range
 from certbound.values.continuous.surface import Surface
+from certbound.values.polynomials import QUARTERS
 
 Found = TypeVar("Found")
 

@@ -11,7 +11,7 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 from certbound.values.continuous.curved.boundaries import Walls
 from certbound.values.continuous.plane import Floats, reach_of
-from certbound.values.continuous.room import faces_of, refuse_windows
+from certbound.values.room import faces_of, refuse_windows
 from certbound.values.sets import as_stays
 
 _MARGIN = 0.1  # of the walls' extent: the box reaches beyond them, so that V may be continued there

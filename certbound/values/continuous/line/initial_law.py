@@ -16,8 +16,8 @@ from certbound.rigor.intervals import Interval
 from certbound.values.continuous.hypotheses import extreme_over
 from certbound.values.continuous.line.joins import Profile
 from certbound.values.continuous.line.phases import Phase
-from certbound.values.continuous.room import points_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import points_of
 
 _PARTS = 24
 

@@ -14,8 +14,8 @@ import numpy as np
 from certbound.arrays import Array, Index, Mask
 from certbound.rigor.intervals import Interval, stack
 from certbound.values.continuous.line.phases import Gate, Phase
-from certbound.values.continuous.polynomials import HERMITE
 from certbound.values.continuous.surface import Surface
+from certbound.values.polynomials import HERMITE
 
 _PARTS = 12
 

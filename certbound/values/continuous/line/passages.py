@@ -29,9 +29,9 @@ from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.coefficients import enclose, squared_diffusion
-from certbound.values.continuous.room import points_of
+from certbound.values.enclosing import enclose, squared_diffusion
 from certbound.values.exact import interval_of, polynomial_of
+from certbound.values.room import points_of
 from certbound.values.sets import as_stays
 
 _CELLS = 2**13

@@ -28,7 +28,7 @@ from certbound.problem.model import JUMPS, Tape, jacobian, sources
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.coefficients import enclose, squared_diffusion
+from certbound.values.enclosing import enclose, squared_diffusion
 
 _PARTS = 64  # of the bounded state
 

@@ -27,7 +27,7 @@ from certbound.values.continuous.plane.plane_below import bound_plane_below, pla
 from certbound.values.continuous.plane.plane_grids import Pair, Plane
 from certbound.values.continuous.plane.plane_reach import plane_of
 from certbound.values.continuous.plane.two_sides import BELOW, RATE, bound_plane_above, rough_level
-from certbound.values.continuous.room import faces_of, points_of, starts_of
+from certbound.values.room import faces_of, points_of, starts_of
 from certbound.values.sets import as_stays
 from certbound.watch import OutOfTime
 

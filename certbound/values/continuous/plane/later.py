@@ -12,8 +12,8 @@ from certbound.values.continuous.plane.plane_proposal import SolverBelow
 from certbound.values.continuous.plane.solver import Solver
 from certbound.values.continuous.plane.stages import Stage
 from certbound.values.continuous.plane.target_proposal import smooth
-from certbound.values.continuous.polynomials import HERMITE
 from certbound.values.continuous.surface import Surface
+from certbound.values.polynomials import HERMITE
 
 _BENT = 3.0  # cells over which V leaves 0 inside a gate that is narrower than the box
 _NEW = 1e-3  # a face where what follows is lower than minus this is new

@@ -12,7 +12,7 @@ from certbound.problem.model import Node, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.values.continuous.hypotheses import Model
 from certbound.values.continuous.plane.plane_grids import Pair, Plane
-from certbound.values.continuous.room import Room
+from certbound.values.room import Room
 
 _PATHS, _STEPS = 400, 200
 _BEYOND = 0.35  # how far beyond simulated paths a box ends, in units of their extent

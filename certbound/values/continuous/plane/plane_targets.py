@@ -42,8 +42,8 @@ from certbound.values.continuous.plane.plane_reach import plane_of, reach_of
 from certbound.values.continuous.plane.target_proposal import Fate, propose_to_target, sides_of
 from certbound.values.continuous.plane.two_sides import RATE
 from certbound.values.continuous.residual import value_range
-from certbound.values.continuous.room import limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import limits_of, points_of, starts_of
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]

@@ -38,8 +38,8 @@ from certbound.values.continuous.plane.plane_reach import plane_of
 from certbound.values.continuous.plane.solver import integrated
 from certbound.values.continuous.plane.stages import Stage, master_nodes, nodes_within, stages_of
 from certbound.values.continuous.plane.two_sides import RATE, Sketch
-from certbound.values.continuous.room import points_of, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import points_of, starts_of
 from certbound.watch import OutOfTime
 
 _SHARES = (0.12, 0.5)  # of the patches, for one grid after the other

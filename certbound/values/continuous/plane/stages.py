@@ -19,8 +19,8 @@ from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.values.continuous.plane.plane_grids import Pair, Plane, mean_deviation
 from certbound.values.continuous.plane.plane_reach import reach_of
-from certbound.values.continuous.room import faces_of
 from certbound.values.grids import graded_axis
+from certbound.values.room import faces_of
 from certbound.values.sets import as_stays
 
 _BEYOND = 0.6  # of the paths' extent, where nothing bounds a state

@@ -38,8 +38,8 @@ from certbound.values.continuous.plane.plane_below import bound_plane_below, pla
 from certbound.values.continuous.plane.plane_grids import Pair, Plan, Plane, Source, slab_times
 from certbound.values.continuous.plane.plane_proposal import propose_plane
 from certbound.values.continuous.plane.plane_reach import closed_plane, led, plane_of, reach_of
-from certbound.values.continuous.room import Room, limits_of, points_of, starts_of
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import Room, limits_of, points_of, starts_of
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]

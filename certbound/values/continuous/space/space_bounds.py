@@ -34,11 +34,11 @@ from certbound.values.continuous.hypotheses import (
 )  # fmt: skip
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Plan, Source, integrated, slab_times
-from certbound.values.continuous.room import starts_of
 from certbound.values.continuous.space.space_box import closed_room
 from certbound.values.continuous.space.space_grids import Space
 from certbound.values.continuous.space.space_solver import SpaceSolver
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import starts_of
 from certbound.watch import OutOfTime
 
 _FACTORS = (0.5, 0.6, 0.8, 1.12, 1.12, 1.12)

@@ -9,7 +9,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
-from certbound.values.continuous.room import limits_of
+from certbound.values.room import limits_of
 
 _PATHS, _STEPS = 400, 200
 _BEYOND = 0.35  # of the paths' extent

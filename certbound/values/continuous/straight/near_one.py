@@ -32,10 +32,10 @@ from certbound.values.continuous.hypotheses import (
 from certbound.values.continuous.payment import Payment
 from certbound.values.continuous.plane import Found, Plane, Source, held_plane, plane_of, rough_level, two_states
 from certbound.values.continuous.rare import RAREST, bound_rare
-from certbound.values.continuous.room import Room, points_of, starts_of
 from certbound.values.continuous.straight.ramps import SMALL, Ramps, ramp_of
 from certbound.values.continuous.straight.relative import relative_above, relative_below, seen_above, seen_below
 from certbound.values.continuous.surface import Surface
+from certbound.values.room import Room, points_of, starts_of
 from certbound.watch import OutOfTime
 
 Proposed = tuple[Surface, Payment]

@@ -25,8 +25,8 @@ from certbound.problem.problem import Problem
 from certbound.rigor import rounding
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.coefficients import enclose
 from certbound.values.continuous.line.stationary.mean_time import limits_of, squared_of
+from certbound.values.enclosing import enclose
 
 _DEGREE = 28
 _CELLS = 2**14

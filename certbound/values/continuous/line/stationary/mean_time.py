@@ -29,7 +29,7 @@ from certbound.problem.model import Tape, compile_numpy, jacobian, sources
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
-from certbound.values.continuous.coefficients import enclose, squared_diffusion
+from certbound.values.enclosing import enclose, squared_diffusion
 from certbound.values.exact import interval_of
 from certbound.watch import poll
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.backward.setting import Setting
+from certbound.values.kolmogorov.box_setting import Setting
 
 _FINE = 100001  # points on which an axis is planned
 _ALONG = 41  # points along each axis of a face
@@ -37,7 +37,10 @@ class Grazing:
 
 
 def plan_axes(setting: Setting, cell: Array, row: int) -> tuple[list[Array], list[Grazing]]:
-    """Nodes of each axis, and where paths graze; ``cell`` holds a share of the range an axis, ``row`` says which ends (inner 0)."""
+    """Nodes of each axis, and where paths graze.
+
+    ``cell`` holds a share of the range for each axis; ``row`` says which ends of the box are meant (0: the inner ones).
+    """
     low, high = setting.low[row], setting.high[row]
     width = setting.range[1] - setting.range[0]
     cell = np.broadcast_to(cell, width.shape)

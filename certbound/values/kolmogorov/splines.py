@@ -1,8 +1,8 @@
 """Quintic splines on graded axes: linear maps along one axis, and how tensors of any dimension are mapped by them.
 
 An axis has nodes z_0 < ... < z_N. Its splines are C^4, of degree 5, with a simple knot at every inner node and clamped
-ends: N + 5 coefficients. The *lattice* of an axis is the points at which its cells are sampled, nodes among them. Whatever
-proposes a spline, the spline is its coefficients: the proofs read these alone.
+ends: N + 5 coefficients. The *lattice* of an axis is the points at which its cells are sampled, nodes among them.
+Whatever proposes a spline, the spline is its coefficients: the proofs read these alone.
 
 Proved of an axis, in exact arithmetic: on cell c the k-th derivative lies between the least and the largest of its
 control values c, ..., c + 5 - k (the convex hull of B-splines); its first and last coefficient are its values at the
@@ -17,11 +17,10 @@ from functools import cached_property, lru_cache
 from math import factorial
 
 import numpy as np
-from scipy.interpolate import BSpline, make_interp_spline
 
 from certbound.arrays import Array, Index
 from certbound.lazy import compiled
-from certbound.values.continuous.polynomials import lebesgue, nodes_of, to_bernstein
+from certbound.values.polynomials import lebesgue, nodes_of, to_bernstein
 
 DEGREE = 5
 ROUNDOFF = 200 * 2.0**-53
@@ -263,6 +262,8 @@ class Axis:
 
     def at_points(self, points: Array, order: int) -> Banded:
         """The ``order``-th derivative at points, from the coefficients."""
+        from scipy.interpolate import BSpline
+
         count = self.cells + DEGREE
         place = np.clip(np.searchsorted(self.nodes, points, side="right") - 1, 0, self.cells - 1)
         values = BSpline(self.knots, np.eye(count), DEGREE)
@@ -279,6 +280,8 @@ class Axis:
     @cached_property
     def bernstein(self) -> Banded:
         """The Bernstein coefficients of degree 5 on each cell, six rows a cell."""
+        from scipy.interpolate import BSpline
+
         count = DEGREE + 1
         inner = np.array(nodes_of(count))
         points = self.nodes[:-1, None] + np.diff(self.nodes)[:, None] * inner
@@ -309,7 +312,8 @@ class Axis:
         """
         sums = [one.absolute() for one in self.on_lattice]
         moved = 1 + np.maximum(np.abs(self.nodes[1:]), np.abs(self.nodes[:-1])) / self.widths
-        first, second, third = (moved * sliding_max(row, 0, self.sampling.parts + 1, self.sampling.parts) for row in sums)
+        parts = self.sampling.parts
+        first, second, third = (moved * sliding_max(row, 0, parts + 1, parts) for row in sums)
         return first, second, third
 
     @cached_property
@@ -326,6 +330,8 @@ class Axis:
 
         ``nodes`` may reach beyond the axis; its part within must be the axis' own. Shape (N + 5, len(nodes)).
         """
+        from scipy.interpolate import BSpline, make_interp_spline
+
         nodes = self.nodes if nodes is None else nodes
         averages = np.array([self.knots[i + 1 : i + DEGREE + 1].mean() for i in range(self.cells + DEGREE)])
         averages = np.clip(averages, self.nodes[0], self.nodes[-1])

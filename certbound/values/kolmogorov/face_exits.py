@@ -9,9 +9,9 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.rigor.intervals import Interval
-from certbound.values.backward.coefficients import Fields
-from certbound.values.backward.splines import Axis, most_on_cells
-from certbound.values.continuous.coefficients import enclose
+from certbound.values.enclosing import enclose
+from certbound.values.kolmogorov.cell_fields import Fields
+from certbound.values.kolmogorov.splines import Axis, most_on_cells
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -14,9 +14,9 @@ from certbound.problem.model import Tape, compile_numpy
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem
-from certbound.values.backward.coefficients import Fields
-from certbound.values.continuous.coefficients import squared_diffusion
-from certbound.values.continuous.room import limits_of
+from certbound.values.enclosing import squared_diffusion
+from certbound.values.kolmogorov.cell_fields import Fields
+from certbound.values.room import limits_of
 
 _PATHS, _STEPS, _EVERY = 2000, 400, 10
 _RARE = 2e-4  # share of the visits that lies beyond the range on either side
@@ -120,7 +120,9 @@ def _in_floats(tape: Tape, n: int) -> Callable[[Array], Array]:
 def _visited(problem: Problem, low: Array, high: Array, inner_low: Array, inner_high: Array) -> Array:
     """Quantiles of where simulated paths are while they are safe, shape (2, n)."""
     rng, n = np.random.default_rng(0), problem.system.dimension
-    g = problem.system.diffusion
+    system = problem.system
+    assert isinstance(system, ContinuousSystem)
+    g = system.diffusion
     flow = _in_floats(problem.closed_loop, n)
     columns = g.shape[1]
     noise = _in_floats(g, n) if isinstance(g, Tape) else lambda x: np.asarray(g)[:, :, None].reshape(n * columns, 1)

@@ -23,19 +23,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb
+from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.values.backward.coefficients import Field
-from certbound.values.backward.splines import (
+from certbound.values.kolmogorov.cell_fields import Field
+from certbound.values.kolmogorov.splines import (
     DEGREE,
     ROUNDOFF,
     Axis,
     Derivatives,
     cell_combinations,
-    over_cells,
     outer,
+    over_cells,
     plus,
     unit,
 )
@@ -68,10 +69,10 @@ class Generator:
     def on_lattice(self, coefficients: Array) -> tuple[Array, Array]:
         """v and L v at the lattice points."""
         n = len(self.axes)
-        parts = {(): coefficients}
+        parts: dict[tuple[int, ...], Array] = {(): coefficients}
         wanted = {orders for orders, _, _ in self.terms} | {(0,) * n}
         for axis in range(n):
-            new = {}
+            new: dict[tuple[int, ...], Array] = {}
             for orders in {one[: axis + 1] for one in wanted}:
                 new[orders] = self.axes[axis].on_lattice[orders[-1]].along(parts[orders[:-1]], axis + 1)
             parts = new
@@ -87,7 +88,7 @@ class Generator:
         ``sizes`` bounds the derivatives of every b_j, ``rates`` those of every (v_t)_j.
         """
         n = len(self.axes)
-        total = 0.0
+        total = np.zeros(())
         for orders, field, weight in self.terms:
             total = total + weight * field.error * sizes(orders)
         scale = 1.0
@@ -111,19 +112,25 @@ class Generator:
         for orders, field, weight in self.terms:
             factors = [axis.condition[order] for axis, order in zip(self.axes, orders)]
             total = total + weight * field.slopes[0][0] * outer(factors) * sizes(zero)
-        return 4 * ROUNDOFF * total
+        return np.asarray(4 * ROUNDOFF * total)
+
+
+Part = tuple[Derivatives, "slice[Any, Any, Any]", Any]
+"""Tensor splines, which of them, and the factor."""
 
 
 class Sizes:
     """Bounds of the derivatives of several functions, each a sum of tensor splines with factors, on every cell."""
 
-    def __init__(self, groups: Sequence[Sequence[tuple[Derivatives, slice, float]]]) -> None:
+    def __init__(self, groups: Sequence[Sequence[Part]]) -> None:
         self.groups, self.known = groups, dict[tuple[int, ...], Array]()
 
     def __call__(self, orders: tuple[int, ...]) -> Array:
         """The largest over the functions."""
         if orders not in self.known:
-            sums = [sum(factor * part.size(orders)[rows] for part, rows, factor in group) for group in self.groups]
+            sums = []
+            for group in self.groups:
+                sums.append(np.add.reduce([factor * part.size(orders)[rows] for part, rows, factor in group]))
             self.known[orders] = np.maximum.reduce(sums) * (1 + 1e-13)
         return self.known[orders]
 

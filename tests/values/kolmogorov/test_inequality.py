@@ -8,10 +8,10 @@ import pytest
 import certbound as cb
 from certbound.errors import EnclosureError
 from certbound.rigor.intervals import Interval
-from certbound.values.backward.coefficients import Fields
-from certbound.values.backward.residual import Generator, residual_bound
-from certbound.values.backward.setting import setting_of
-from certbound.values.backward.splines import Axis, Derivatives, Sampling, most_on_cells
+from certbound.values.kolmogorov.box_setting import setting_of
+from certbound.values.kolmogorov.cell_fields import Fields
+from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
+from certbound.values.kolmogorov.splines import Axis, Derivatives, Sampling, most_on_cells
 
 PARTS = (2, 3, 4)
 

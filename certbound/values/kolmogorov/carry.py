@@ -10,22 +10,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import maximum_filter, uniform_filter
 
 from certbound.arrays import Array, Mask
 from certbound.rigor.intervals import Interval
-from certbound.values.backward.axes import Grazing, plan_axes
-from certbound.values.backward.exits import Face, face_of, shortfall
-from certbound.values.backward.residual import Generator, residual_bound
-from certbound.values.backward.setting import Setting
-from certbound.values.backward.solve import Discretised, discretised
-from certbound.values.backward.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
+from certbound.values.kolmogorov.axes import Grazing, plan_axes
+from certbound.values.kolmogorov.box_setting import Setting
+from certbound.values.kolmogorov.face_exits import face_of, shortfall
+from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
+from certbound.values.kolmogorov.solve import Discretised, discretised
+from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
 
-END = 0.004  # of the horizon: the layer at its end
-_FIRST, _GROWTH = 12, 1.3  # steps within that layer, and how they grow
-_MARGIN, _MORE = 0.1, 1.0  # by which the first source exceeds what it pays for, and how this grows from pass to pass
+END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
+_FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
+_MARGIN = 0.1  # by which a source exceeds what it pays for
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
 _SOFT = 3.0
 _KILL = 10.0
@@ -39,9 +40,10 @@ def ramp(y: Array) -> Array:
     return np.asarray(z**3 * (10 - 15 * z + 6 * z * z))
 
 
-def time_steps(horizon: float, count: int) -> Array:
+def time_steps(horizon: float, count: int, layer: float) -> Array:
     """Lengths of the steps from the end backward: small in the end layer, growing to horizon / count."""
-    largest, step, result = horizon / count, END * horizon / _FIRST, []
+    largest, step = horizon / count, layer / _FIRST
+    result: list[float] = []
     while step < largest and sum(result) + step < horizon:
         result.append(step)
         step *= _GROWTH
@@ -56,7 +58,6 @@ class Mesh:
 
     nodes: tuple[Array, ...]
     pad: tuple[tuple[int, int], ...]
-    points: Array
     equation: Discretised
     layer: Array
     at_limit: Mask
@@ -71,23 +72,20 @@ def extended(nodes: Array, before: int, behind: int) -> Array:
 
 
 def mesh_of(
-    setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool
+    setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool,
+    span: float,
 ) -> Mesh:
     """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones."""
     n = setting.dimension
     low, high = setting.low[row], setting.high[row]
     free = {(one.axis, one.side) for one in grazing}
-    pads = tuple(
-        tuple(pad[0] if (i, side) in free else pad[1] for side in (0, 1))
-        for i in range(n)
-    )
+    pads = tuple((pad[(i, 0) not in free], pad[(i, 1) not in free]) for i in range(n))
     lines = tuple(extended(nodes[i], *pads[i]) for i in range(n))
     points = np.array(np.meshgrid(*lines, indexing="ij"))
     shape = points.shape[1:]
     inside = np.clip(points, low.reshape(-1, *[1] * n), high.reshape(-1, *[1] * n))
     flow, spread = setting.flow(inside), setting.spread(inside).reshape(n, n, *shape)
     dead, at_limit, layer, rate = np.zeros(shape, bool), np.zeros(shape, bool), np.ones(shape), np.zeros(shape)
-    span = END * setting.horizon
     for i in range(n):
         for side, place in ((0, 0), (1, shape[i] - 1)):
             face = tuple(place if k == i else slice(None) for k in range(n))
@@ -116,12 +114,24 @@ def mesh_of(
             width = (0.3 * _SOFT**3 + 2) * one.scale
             rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(flow[one.axis] / (_SOFT * one.speed))
     layer[dead] = 0
-    return Mesh(nodes=lines, pad=pads, points=points, equation=discretised(lines, flow, spread, dead, rate), layer=layer,
-                at_limit=at_limit, rate=rate)  # fmt: skip
+    equation = discretised(lines, flow, spread, dead, rate)
+    return Mesh(nodes=lines, pad=pads, equation=equation, layer=layer, at_limit=at_limit, rate=rate)
 
 
 def _bump(y: Array) -> Array:
     return np.asarray(np.exp(-y * y / 2))
+
+
+def _nothing(part: float) -> float:
+    return 0.0
+
+
+def _between(first: Array, last: Array, part: float) -> Array:
+    return (1 - part) * first + part * last
+
+
+def _later(given: Callable[[float], Array | float], begin: float, step: float, part: float) -> Array | float:
+    return given(begin + part * step)
 
 
 class Side:
@@ -130,7 +140,7 @@ class Side:
     Parameters
     ----------
     setting : Setting
-    cell : float
+    cell : ndarray, shape (n,)
         Width of a cell as a share of the range.
     steps : int
         Steps over the horizon.
@@ -138,14 +148,15 @@ class Side:
         From above or from below.
     """
 
-    def __init__(self, setting: Setting, cell: float, steps: int, above: bool, parts: int | None = None) -> None:
+    def __init__(self, setting: Setting, cell: Array, steps: int, above: bool, parts: int | None = None) -> None:
         self.setting, self.above = setting, above
         row = 0 if above else 1
+        self.layer = END * float(np.mean(cell)) * setting.horizon
         nodes, grazing = plan_axes(setting, cell, row)
         self.axes = tuple(Axis(line, Sampling(parts or (4 if len(nodes) < 3 else 2))) for line in nodes)
-        self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above)
-        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False)
-        self.steps = time_steps(setting.horizon, steps)
+        self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer)
+        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer)
+        self.steps = time_steps(setting.horizon, steps, self.layer)
         everywhere = Interval.point(0.0)
         self.generator = Generator.of(
             self.axes, setting.drift.on(self.axes, everywhere), setting.square.on(self.axes, everywhere)
@@ -157,7 +168,6 @@ class Side:
             face_of(self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])))
             for i in range(n) for side in (0, 1)
         ]
-        self.margin = _MARGIN
         self.values: list[Array] = []
         self.rates: list[Array] = []
 
@@ -176,23 +186,23 @@ class Side:
 
     def shortfall_at_end(self) -> Array:
         """What v(T) lacks of 0 on every cell."""
-        return np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0)
+        return np.asarray(np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0))
 
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
-        equation, span = self.mesh.equation, END * self.setting.horizon
+        equation, span = self.mesh.equation, self.layer
         above, limit = self.above, self.mesh.at_limit
 
         def fall(tau: float) -> Array | float:
             if above or tau >= span:
                 return 0.0
-            return -30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit
+            return np.asarray(-30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit)
 
         a = self.mesh.layer.copy() if above else np.ones(equation.shape)
         tau = 0.0
         self._keep(a, equation.speed(a, 0.0, fall(tau)))
         for step in self.steps:
-            a = equation.step(a, step, lambda part: 0.0, lambda part, tau=tau, step=step: fall(tau + part * step))
+            a = equation.step(a, step, _nothing, partial(_later, fall, tau, step))
             tau += step
             self._keep(a, equation.speed(a, 0.0, fall(tau)))
 
@@ -227,16 +237,14 @@ class Side:
         """Solve for the error that the residuals leave, and for what v lacks at exits and at the end; add it to v."""
         equation = self.carrier.equation
         slabs = [self._spread(r) + b for r, b in zip(residuals, self._at_exits())]
-        ends = [slabs[0], *(np.maximum(p, q) for p, q in zip(slabs, slabs[1:])), slabs[-1]]
-        ends = [(1 + self.margin) * s * equation.live for s in ends]
-        missing = (1 + self.margin) * self._spread(self.shortfall_at_end()) * equation.live
+        ends = [slabs[0], *(np.maximum(p, q) for p, q in pairwise(slabs)), slabs[-1]]
+        ends = [(1 + _MARGIN) * s * equation.live for s in ends]
+        missing = (1 + _MARGIN) * self._spread(self.shortfall_at_end()) * equation.live
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
         self._add(0, e, equation.speed(e, ends[0]))
         for k, step in enumerate(self.steps):
-            begin, end = ends[k], ends[k + 1]
-            e = equation.step(e, step, lambda part, p=begin, q=end: (1 - part) * p + part * q, lambda part: 0.0)
-            self._add(k + 1, e, equation.speed(e, end))
-        self.margin *= _MORE
+            e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
+            self._add(k + 1, e, equation.speed(e, ends[k + 1]))
 
     def _at_exits(self) -> list[Array]:
         """Sources beyond the faces, from which e takes what v lacks there, slab by slab."""
@@ -260,6 +268,8 @@ class Side:
 
     def _spread(self, cells: Array, skip: int | None = None) -> Array:
         """A smooth source on the carrier's nodes above what is asked for on the cells."""
+        from scipy.ndimage import maximum_filter, uniform_filter
+
         for axis, (before, behind) in enumerate(self.carrier.pad):
             if axis != skip:
                 around = [(before + 1, behind + 1) if k == axis else (0, 0) for k in range(cells.ndim)]

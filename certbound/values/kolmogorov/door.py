@@ -13,14 +13,14 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
-from certbound.values.backward.carry import Side
-from certbound.values.backward.setting import Setting, setting_of
-from certbound.values.backward.splines import Derivatives, unit
+from certbound.values.kolmogorov.box_setting import Setting, setting_of
+from certbound.values.kolmogorov.carry import Side
+from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
 from certbound.watch import poll
 
 _COARSEST = {2: 0.06, 3: 0.07}  # cell of the first grid, as a share of the range
-_STEPS = 1.8  # cells of the range a step: errors in space and in time are about alike then
-_PASSES = 8
+_STEPS = 2.4  # cells of the range a step: errors in space and in time are about alike then
+_PASSES, _USUAL = 8, 5  # at most, and in most cases
 _CLOSE = 1.01  # ratio of the bounds that ends the search
 _PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
 _GROWTH = 6.0  # the largest factor of work from one grid to the next
@@ -65,8 +65,8 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     problem : Problem
         Continuous time, two or three states, limits along the coordinates; any noise.
     seconds : float
-        How long to refine, in units of work (`RATE`): the bounds do not depend on the machine or its load. The first
-        grid is finished in any case.
+        How long to refine, in units of work (`RATE`): the bounds do not depend on the machine or its load. Nothing is
+        proved where the coarsest grid takes more.
     delta : float
         Where the numerical solution says on which side of ``delta`` the answer lies, only the bound that shows it is
         looked for; 0 for both.
@@ -86,22 +86,26 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     setting = setting_of(problem)
     if setting.dimension not in _COARSEST:
         raise InfeasibleError("values with a carried error serve two and three states here.")
-    starts, cell = _starts(problem), _COARSEST[setting.dimension]
+    starts, cell = starts_in(problem), _COARSEST[setting.dimension]
     budget = seconds * RATE[setting.dimension]
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
-    sides = (True, False)
+    sides: tuple[bool, ...] = (True, False)
     while True:
         before, count = work, math.ceil(_STEPS / cell)
         for above in sides:
             side = Side(setting, np.full(setting.dimension, cell), count, above)
+            if not runs and len(sides) * _USUAL * side.work > budget:  # no grid fits
+                yield Bounds(lower=0.0, upper=1.0, cells=cells_of(side.axes), steps=count, runs=0, estimate=math.nan,
+                             work=0.0)  # fmt: skip
+                return
             side.propose()
             estimate = abs(largest_at_start(side, starts)[0])
             bound, passes = refined(side, starts)
             work += passes * side.work
             lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
         runs += 1
-        cells = tuple(axis.cells for axis in side.axes)
-        yield Bounds(lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work)
+        yield Bounds(lower=lower, upper=upper, cells=cells_of(side.axes), steps=count, runs=runs, estimate=estimate,
+                     work=work)  # fmt: skip
         growth = min(_GROWTH, (budget - work) / (work - before))
         if upper <= _CLOSE * lower or upper <= delta or lower > delta > 0 or growth < _LEAST:
             return
@@ -112,21 +116,20 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
 
 
 def refined(side: Side, starts: Starts) -> tuple[float, int]:
-    """The bound of one side: passes of the carried error until what is left of the residual is paid at once, and their number."""
-    best = math.inf
-    for k in range(_PASSES):
+    """The bound of one side: passes of the carried error until what is left of the residual is paid; their number."""
+    best, passes = math.inf, 0
+    while passes < _PASSES:
+        passes += 1
         poll("solving for the error that is left")
         residuals = side.residuals()
         left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
-        missing = max([float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls())])
+        missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
         value = largest_at_start(side, starts)[1]
-        total = (value + (left + missing) * (1 + 1e-9)) + 1e-15
-        best = min(best, total)
-        end = 1.0 if side.above else 0.0
-        if left + missing <= _PAID * abs(value) or value >= end or k == _PASSES - 1:
+        best = min(best, value + (left + missing) * (1 + 1e-9) + 1e-15)
+        if left + missing <= _PAID * abs(value) or value >= (1.0 if side.above else 0.0):
             break
         side.correct(residuals)
-    return best, k + 1
+    return best, passes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -138,7 +141,7 @@ class Starts:
     points: Array
 
 
-def _starts(problem: Problem) -> Starts:
+def starts_in(problem: Problem) -> Starts:
     lows, highs, points = [], [], []
     for start in problem.starts:
         if isinstance(start, GaussianStart):
@@ -171,10 +174,10 @@ def largest_at_start(side: Side, starts: Starts) -> tuple[float, float]:
     n = len(side.axes)
     for low, high in zip(starts.low, starts.high):
         lines = [np.unique(np.linspace(a, b, _STARTS if a < b else 1)) for a, b in zip(low, high)]
-        values = coefficients
+        samples = coefficients
         for k, (axis, line) in enumerate(zip(side.axes, lines)):
-            values = axis.at_points(line, 0).along(values, k)
-        most = float(values.max())
+            samples = axis.at_points(line, 0).along(samples, k)
+        most = float(samples.max())
         extra = 0.0
         for k, line in enumerate(lines):
             if len(line) > 1:

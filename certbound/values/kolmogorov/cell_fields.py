@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from certbound.arrays import Array, Mask
 from certbound.errors import EnclosureError
 from certbound.problem.model import Node, Tape, jacobian
 from certbound.rigor.intervals import Interval
-from certbound.values.backward.splines import Axis, cell_combinations, cells_of, over_cells
-from certbound.values.continuous.coefficients import enclose
+from certbound.values.enclosing import enclose
+from certbound.values.kolmogorov.splines import Axis, cell_combinations, cells_of, over_cells
 
 _UP = 1 + 1e-12
 
@@ -49,6 +49,7 @@ class Field:
         return self.slopes[0][0] + self.error
 
 
+@lru_cache(maxsize=64)
 def derivative_of(tape: Tape, axis: int, order: int) -> Tape:
     """The tape of d_i^order F over ``("t", *states, ...)``, ``axis`` counted among the states."""
     for _ in range(order):
@@ -86,16 +87,13 @@ class Fields:
         ends = [axis.nodes for axis in axes]
         ranges, edge = self._enclosed(self.tape, [e[:-1] for e in ends], [e[1:] for e in ends], time, branch)
         tails = [
-            self._magnitudes(self._tail(k, axis.sampling.parts + 1), ends, time, branch) for k, axis in enumerate(axes)
+            self._magnitudes(derivative_of(self.tape, k, axis.sampling.parts + 1), ends, time, branch)
+            for k, axis in enumerate(axes)
         ]
         result: list[Field | None] = []
         for k, present in enumerate(self.present):
             result.append(self._field(axes, points[k], ranges[k], edge, [t[k] for t in tails]) if present else None)
         return result
-
-    @cache
-    def _tail(self, axis: int, order: int) -> Tape:
-        return derivative_of(self.tape, axis, order)
 
     def _enclosed(
         self, tape: Tape, low: list[Array], high: list[Array] | None, time: Interval, branch: Sequence[Interval]

@@ -14,7 +14,7 @@ import scipy.sparse.linalg as sl
 
 from certbound.arrays import Array, Mask
 from certbound.lazy import compiled
-from certbound.values.backward.splines import Banded, back, thin
+from certbound.values.kolmogorov.splines import Banded, back, thin
 
 GAMMA = 0.4358665215084589
 _MIDDLE = (1 + GAMMA) / 2
@@ -49,7 +49,7 @@ DRIFT: Stencils = ((-2, 3), (-1, 2))
 NOISE: Stencils = ((-3, 3), (-2, 2))
 _CENTRAL: Stencils = ((-2, 2),)
 
-Source = Callable[[float], Array]
+Source = Callable[[float], Array | float]
 """Of the share of a step that has passed."""
 
 
@@ -80,7 +80,9 @@ def difference(nodes: Array, stencils: Stencils, order: int) -> sp.csr_array:
     Where none fits the last one is moved inward.
     """
     count = len(nodes)
-    rows, columns, values = [], [], []
+    rows: list[int] = []
+    columns: list[int] = []
+    values: list[float] = []
     for i in range(count):
         fitting = [one for one in stencils if i + one[0] >= 0 and i + one[1] < count]
         first, last = fitting[0] if fitting else stencils[-1]
@@ -225,7 +227,7 @@ class SplitEquation:
             for j in range(i):
                 right = right + _MIXED[i, j] / step * stages[j]
             stages.append(self.solve(step * _DIAGONAL, step * _DIAGONAL * right))
-        return values + sum(weight * stage for weight, stage in zip(_WEIGHTS, stages))
+        return np.asarray(values + sum(weight * stage for weight, stage in zip(_WEIGHTS, stages)))
 
 
 Discretised = Equation | SplitEquation

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import certbound as cb
-from certbound.values.backward import bound_failing
-from certbound.values.backward.carry import Side
-from certbound.values.backward.door import _starts, refined
-from certbound.values.backward.setting import setting_of
+from certbound.values.kolmogorov import bound_failing
+from certbound.values.kolmogorov.box_setting import setting_of
+from certbound.values.kolmogorov.carry import Side
+from certbound.values.kolmogorov.door import refined, starts_in
+
+SHARES = {"half": 0.5, "nothing": 0.0}
 
 
 def last(problem: cb.Problem, seconds: float = 1.0, delta: float = 0.0):
@@ -17,7 +19,7 @@ def last(problem: cb.Problem, seconds: float = 1.0, delta: float = 0.0):
 
 
 def two_independent(sigma: float = 0.5) -> tuple[cb.Problem, float]:
-    """Two copies of one state, and what fails by the product of their survivals (proved to three digits in one state)."""
+    """Two copies of one state, and what fails by the product of survivals that are proved to three digits."""
     system = cb.ContinuousSystem(lambda x, y: [-x, -y], states=["x", "y"], diffusion=sigma * np.eye(2))
     one = cb.ContinuousSystem(lambda x: [-x[0]], states=1, diffusion=[[sigma]])
     alone = cb.Problem(one, initial=[0.2], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2.0)
@@ -52,7 +54,7 @@ def test_noise_in_the_velocity_alone_is_bounded_from_both_sides() -> None:
 
 
 @pytest.mark.parametrize("above", [True, False])
-@pytest.mark.parametrize("wrong", ["noise", "half", "nothing"])
+@pytest.mark.parametrize("wrong", ["noise", *SHARES])
 def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -> None:
     problem, truth = two_independent()
     setting, rng = setting_of(problem), np.random.default_rng(7)
@@ -60,8 +62,8 @@ def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -
     side.propose()
     for rows in (side.values, side.rates):
         for k, row in enumerate(rows):
-            rows[k] = row + 0.02 * rng.normal(size=row.shape) if wrong == "noise" else 0.5 * row if wrong == "half" else 0 * row
-    bound, _ = refined(side, _starts(problem))
+            rows[k] = row + 0.02 * rng.normal(size=row.shape) if wrong == "noise" else SHARES[wrong] * row
+    bound, _ = refined(side, starts_in(problem))
     if above:
         assert bound >= truth * (1 - 1e-3)
     else:
@@ -93,4 +95,4 @@ def test_three_states_are_bounded_from_above() -> None:
     setting = setting_of(problem)
     side = Side(setting, np.full(3, 0.1), 10, True)
     side.propose()
-    assert refined(side, _starts(problem))[0] >= 0.005
+    assert refined(side, starts_in(problem))[0] >= 0.005

@@ -1,0 +1,11 @@
+"""Values whose error the process carries: the backward equation solved in floats, and one inequality proved (Thm K10).
+
+The parts, each above those that it uses: ``splines`` (axes and their lattices), ``cell_fields`` (drift and noise on
+cells), ``slab_residual`` (the only trusted inequality), ``face_exits`` (what is asked of v at faces), ``box_setting``
+(the problem), ``axes`` (graded nodes), ``solve`` (untrusted numerics), ``carry`` (u, and the error that is carried),
+``door``.
+"""
+
+from certbound.values.kolmogorov.door import bound_failing
+
+__all__ = ["bound_failing"]
