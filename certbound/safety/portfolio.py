@@ -118,8 +118,8 @@ class Engine:
 
 
 def _polynomials(problem: Problem) -> float:
-    """In three states a search for a polynomial takes many seconds, and quadratic bounds are there in one."""
-    return 0.5 if problem.system.dimension > 2 else math.inf
+    """In several states a search for a polynomial takes many seconds, and others are near the truth before it ends."""
+    return 0.5 if problem.system.dimension > 1 else math.inf
 
 
 ENGINES: dict[str, Engine] = {
@@ -157,6 +157,17 @@ ENGINES: dict[str, Engine] = {
             chance=linear_chance,
         ),
         Engine(
+            name="backward",
+            words="the backward equation solved in floats, its error bounded cell by cell and carried by the process "
+            "(Thm K10, two and three states in continuous time)",
+            when="while nothing else has proved SAFE; limits along the coordinates, noise along some states or all; "
+            "bounds from both sides",
+            prove=in_coordinates(backward_engine),
+            reserve=True,
+            refines=True,
+            dear=True,
+        ),
+        Engine(
             name="barrier",
             words="the exponential of a polynomial that grows slowly in the mean (continuous time, few states)",
             when="while nothing else has proved SAFE",
@@ -179,17 +190,6 @@ ENGINES: dict[str, Engine] = {
             dear=True,
             soon=4,
             spares=3,
-        ),
-        Engine(
-            name="backward",
-            words="the backward equation solved in floats, its error bounded cell by cell and carried by the process "
-            "(Thm K10, two and three states in continuous time)",
-            when="while nothing else has proved SAFE; limits along the coordinates, noise along some states or all; "
-            "bounds from both sides",
-            prove=in_coordinates(backward_engine),
-            reserve=True,
-            refines=True,
-            dear=True,
         ),
         Engine(
             name="values",

@@ -25,6 +25,8 @@ _CLOSE = 1.01  # ratio of the bounds that ends the search
 _PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
 _GROWTH = 6.0  # the largest factor of work from one grid to the next
 _LEAST = 1.5  # the smallest one that is worth it
+_SHARE, _ORDER = 0.8, 2.0  # of what the target leaves, that an error may take; how fast errors fall with cells
+_FAR = 2.0  # ratio of the coarsest solution to the target, beyond which it says which bound decides
 _STARTS = 9  # points along each side of a start set
 RATE = {2: 1.5e5, 3: 1.0e5}
 """Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
@@ -74,7 +76,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     Yields
     ------
     Bounds
-        The best of all grids so far.
+        The best so far, after every side of every grid.
 
     Raises
     ------
@@ -91,34 +93,46 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
     sides: tuple[bool, ...] = (True, False)
     while True:
-        before, count = work, math.ceil(_STEPS / cell)
+        before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
             side = Side(setting, np.full(setting.dimension, cell), count, above)
-            if not runs and len(sides) * _USUAL * side.work > budget:  # no grid fits
-                yield Bounds(lower=0.0, upper=1.0, cells=cells_of(side.axes), steps=count, runs=0, estimate=math.nan,
-                             work=0.0)  # fmt: skip
+            cells = cells_of(side.axes)
+            if not work and len(sides) * _USUAL * side.work > budget:
+                yield Bounds(lower=0.0, upper=1.0, cells=cells, steps=count, runs=0, estimate=math.nan, work=0.0)
                 return
             side.propose()
             estimate = abs(largest_at_start(side, starts)[0])
-            bound, passes = refined(side, starts)
+            if above and len(sides) > 1 and estimate > _FAR * delta > 0:
+                continue
+            last = (1 + _LEAST) * _USUAL * side.work > budget - work
+            bound, value, passes = refined(side, starts, math.inf if last or not delta else delta if above else -delta)
             work += passes * side.work
             lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
-        runs += 1
-        yield Bounds(lower=lower, upper=upper, cells=cells_of(side.axes), steps=count, runs=runs, estimate=estimate,
-                     work=work)  # fmt: skip
+            yield Bounds(lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work)
+            if upper <= max(_CLOSE * lower, delta) or lower > delta > 0:
+                return
+            if above and _FAR * estimate < delta:
+                sides = (True,)
+                break
         growth = min(_GROWTH, (budget - work) / (work - before))
-        if upper <= _CLOSE * lower or upper <= delta or lower > delta > 0 or growth < _LEAST:
+        if growth < _LEAST:
             return
         if delta > 0:
-            growth *= len(sides)
+            carried, room = abs(abs(value) - estimate), _SHARE * abs(delta - estimate)
+            needed = (carried / max(room, 1e-300)) ** ((setting.dimension + 1) / _ORDER)
+            growth = max(min(growth, needed), _LEAST)
+            growth = min(growth * len(sides), _GROWTH)
             sides = (estimate < delta,)
         cell /= growth ** (1 / (setting.dimension + 1))
 
 
-def refined(side: Side, starts: Starts) -> tuple[float, int]:
-    """The bound of one side: passes of the carried error until what is left of the residual is paid; their number."""
+def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float, float, int]:
+    """The bound of one side: passes of the carried error until what is left of the residual is paid.
+
+    Passes end early once v at the start, which only grows, is beyond ``target``. The bound, v there, and their number.
+    """
     best, passes = math.inf, 0
-    while passes < _PASSES:
+    while True:
         passes += 1
         poll("solving for the error that is left")
         residuals = side.residuals()
@@ -126,10 +140,10 @@ def refined(side: Side, starts: Starts) -> tuple[float, int]:
         missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
         value = largest_at_start(side, starts)[1]
         best = min(best, value + (left + missing) * (1 + 1e-9) + 1e-15)
-        if left + missing <= _PAID * abs(value) or value >= (1.0 if side.above else 0.0):
-            break
+        paid, hopeless = left + missing <= _PAID * abs(value), value >= min(1.0 if side.above else 0.0, target)
+        if paid or hopeless or passes == _PASSES:
+            return best, value, passes
         side.correct(residuals)
-    return best, passes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

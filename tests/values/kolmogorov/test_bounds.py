@@ -63,7 +63,7 @@ def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -
     for rows in (side.values, side.rates):
         for k, row in enumerate(rows):
             rows[k] = row + 0.02 * rng.normal(size=row.shape) if wrong == "noise" else SHARES[wrong] * row
-    bound, _ = refined(side, starts_in(problem))
+    bound, _, _ = refined(side, starts_in(problem))
     if above:
         assert bound >= truth * (1 - 1e-3)
     else:
