@@ -16,10 +16,10 @@ def cholesky(a: arb_mat, budget: Budget | None = None) -> arb_mat:
     `Unproved` where that is not shown to be positive definite.
     """
     n = a.nrows()
+    if budget is not None:
+        budget.balls(n * n * (n + 9) // 3)
     low = [[arb(0)] * n for _ in range(n)]
     for j in range(n):
-        if budget is not None:
-            budget.check()
         pivot = a[j, j] - sum((x * x for x in low[j][:j]), arb(0))
         if not pivot > 0:
             raise Unproved("a matrix is not positive definite")

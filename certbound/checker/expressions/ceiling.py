@@ -55,6 +55,7 @@ class Ceiling:
         for a in range(len(gradient)):
             for b in range(a, len(gradient)):
                 budget.check()
+                budget.hold(2)
                 second[a, b] = graph.derivative(gradient[a], self.slots[b])
         self._pairs = [pair for pair, index in second.items() if not graph.is_const(index, 0.0)]
         hessian = [second[pair] for pair in self._pairs]
@@ -84,7 +85,7 @@ class Ceiling:
             if not stack:
                 return True
             self.budget.box()
-            self.budget.check()
+            self.budget.balls(12 * len(first) + 6 * len(self._pairs))
             current, depth = stack.pop()
             centre = [middle_of(side) for side in current]
             radius = [arb.max(high - c, c - low).upper() for (low, high), c in zip(current, centre)]

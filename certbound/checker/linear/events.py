@@ -20,9 +20,11 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import below_and_above, identity, magnitude, quadratic, tail, upper
 from certbound.checker.linear.response import Piece
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import FUNCTION, Budget, Unproved
 
 _NEGLIGIBLE = 1e-3
+_JOINT = 1_000_000
+"""Units of work of a joint probability; 200 to 400 us measured."""
 
 Level = arb | None
 
@@ -57,6 +59,7 @@ class _Pair:
 
 def union_of_pairs(pairs: Sequence[_Pair], budget: Budget) -> arb:
     """Upper bound of the sum: the joint probability where it matters, the plain tail elsewhere."""
+    budget.balls(len(pairs), 2 * FUNCTION)
     tails = [pair.tail() for pair in pairs]
     total = sum(tails, arb(0))
     if total.is_zero():
@@ -66,7 +69,7 @@ def union_of_pairs(pairs: Sequence[_Pair], budget: Budget) -> arb:
         if value * len(pairs) < _NEGLIGIBLE * total:
             result += value
             continue
-        budget.check()
+        budget.balls(1, _JOINT)
         result += arb.min(value, pair.joint())
     return upper(result)
 
@@ -79,7 +82,7 @@ def chain(
     pairs: list[_Pair] = []
     previous: tuple[arb_mat, Level, arb] | None = None
     for k, (row, level) in enumerate(zip(rows, levels)):
-        budget.check()
+        budget.products(len(row), 3 * len(row) + 30)
         flat = arb_mat(1, len(row), list(row))
         variance = _variance(flat, covariances[k])
         if level is not None:
@@ -100,7 +103,7 @@ def sub_gaussian(
     """Discrete time, sub-Gaussian noise: sum of exp(-z^2/(2 r V r^T))."""
     total = arb(0)
     for k, (row, level) in enumerate(zip(rows, levels)):
-        budget.check()
+        budget.products(len(row) + 8, len(row) + 30)
         if level is None:
             continue
         flat = arb_mat(1, len(row), list(row))
@@ -136,7 +139,7 @@ class Windows:
         for start, end in zip(self.starts, self.ends):
             later = one
             for k in range(end - 1, start - 1, -1):
-                budget.check()
+                budget.products(self.n, self.n, 8 * self.n + 40)
                 try:
                     after = later.inv()
                     earlier = later * pieces[k].transition
@@ -175,6 +178,7 @@ class Windows:
                     value = (level - costs[k]).lower()
                     least = value if least is None else arb.min(least, value)
             tops.append(least)
+        self.budget.balls(4 * len(levels))
         nothing = [arb(0)] * self.n
         return self._chain([nothing if direction is None else direction for direction in directions], tops)
 
@@ -185,7 +189,8 @@ class Windows:
         directions: list[list[arb] | None] = []
         costs: dict[int, arb] = {}
         for window, (start, end) in enumerate(zip(self.starts, self.ends)):
-            self.budget.check()
+            count = sum(asked[start:end])
+            self.budget.balls((1 + count) * 24 * self.n)
             ends = {k: self._ends(rows[k], k) for k in range(start, end) if asked[k]}
             if not ends:
                 directions.append(None)
@@ -201,7 +206,7 @@ class Windows:
         return directions, costs
 
     def _ends(self, row: Sequence[arb], k: int) -> tuple[list[arb], list[arb]]:
-        self.budget.check()
+        self.budget.products(3, self.n, self.n + 20)
         flat = arb_mat(1, self.n, list(row))
         return (flat * self.before[k]).entries(), (flat * self.back[k]).entries()
 
@@ -221,7 +226,7 @@ class Windows:
         pairs = []
         previous: tuple[arb_mat, Level, arb] | None = None
         for window, (direction, level) in enumerate(zip(directions, levels)):
-            self.budget.check()
+            self.budget.products(4, self.n, self.n + 30)
             flat = arb_mat(1, self.n, list(direction))
             first, last = flat * self.forward[window], self.covariances[self.ends[window]]
             begin = self.covariances[self.starts[window]]

@@ -85,8 +85,11 @@ def _demand(
         face = [-x for x in region.face(0)]
         families = [[(face, -arb(region.bounds[0]) - _STRICT)] * count]
     elif region.round:
-        families = [[pair] * count for pair in region.inscribed()]
+        pairs = region.inscribed(budget)
+        budget.take(8 * len(pairs) * count)
+        families = [[pair] * count for pair in pairs]
     else:
+        budget.take(8 * len(region.bounds) * count)
         families = [
             [(region.face(number), arb(b))] * count for number, b in enumerate(region.bounds)
         ]
@@ -99,7 +102,7 @@ def _demand(
     for k in range(count):
         points = grid.points(k, constraint.during) if asked[k] else []
         for family, demand in zip(families, found):
-            budget.check()
+            budget.balls((1 + len(points)) * (4 + len(demand.rows[k])))
             row, bound = family[k]
             offset = bound + _dot(row, centres[k])
             rooms = [offset - _dot(demand.rows[k], point) for point in points]
@@ -110,9 +113,10 @@ def _demand(
 def _lifted(region: Region, family: list[tuple[list[arb], arb]], dimension: int, budget: Budget) -> list[list[arb]]:
     """The rows over all states; one that comes again is the same."""
     known: dict[int, list[arb]] = {}
+    budget.spend(len(family) * 200)
     for row, _ in family:
         if id(row) not in known:
-            budget.check()
+            budget.balls(dimension // 4)
             budget.hold(dimension // 8 + 1)  # most of it is the same 0
             known[id(row)] = region.lift(row, dimension)
     return [known[id(row)] for row, _ in family]
@@ -134,7 +138,7 @@ def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]
         region = constraint.region
         if not (constraint.inside and region.round):
             continue
-        image, bound = region.image(model.dimension)
+        image, bound = region.image(model.dimension, budget)
         asked, centres = grid.asked(constraint.during), centres_of(region, grid, budget)
         budget.hold(len(grid.times))
         rooms: list[arb | None] = []
@@ -146,6 +150,8 @@ def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]
             moved = region.lift(centres[k], model.dimension)
             sizes = []
             for point in grid.points(k, constraint.during):
+                budget.products(image.nrows(), image.ncols())
+                budget.balls(4 * (image.ncols() + image.nrows()))
                 offset = (image * column([a - b for a, b in zip(point, moved)])).entries()
                 sizes.append(sum((x * x for x in offset), arb(0)).upper().sqrt())
             rooms.append((bound + reduce(arb.min, [-size for size in sizes])).lower())
@@ -161,7 +167,7 @@ def centres_of(region: Region, grid: Grid, budget: Budget) -> list[list[arb]]:
     """Enclosures of the centre on every piece."""
     if not isinstance(region.center, Tape):
         return [[arb(x) for x in region.center]] * len(grid.times)
-    budget.hold(len(grid.times) * len(region.coordinates))
+    budget.hold(2 * len(grid.times) * len(region.coordinates))
     graph = Graph(budget)
     nodes = graph.include(region.center, [graph.input(0)])
     program = Program(graph, [nodes[output] for output in region.center.outputs], variables=1)
