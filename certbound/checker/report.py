@@ -146,6 +146,10 @@ class Budget:
         self.fits(size)
         self.memory -= size
 
+    def give(self, size: int) -> None:
+        """Give back so many bytes."""
+        self.memory += size
+
     def fits(self, size: int) -> None:
         """Refuse arrays of so many bytes beside what is held, before they are made; they are gone soon."""
         if size > self.memory:

@@ -21,6 +21,8 @@ from certbound.problem.model import JUMPS, Node, Tape
 
 MOST_PIECES = 1000
 _LARGEST, _LONGEST = 2**53, 4096  # a value of floor that is a float itself, and bits of a fraction
+_PER_LINE, _ENTRY = 20_000, 60
+"""Units of work of an operation on a piece in fractions (2 to 20 us), and bytes of what is kept of a jump on one."""
 _CHOICE = "if_else_zero"
 _OF_TRUTHS = frozenset(["and", "or", "not", _CHOICE])
 _TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}
@@ -42,6 +44,8 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
     timed = _timed(tape)
     ends = [horizon * k / count for k in range(count + 1)]
     found: dict[int, list[float | None]] = {index: [] for index in timed if tape.nodes[index].op in JUMPS | _BENDS}
+    budget.spend(count * (len(timed) + 1) * _PER_LINE)
+    budget.take(count * (len(found) + 1) * _ENTRY)
     for first, last in pairwise(ends):
         budget.check()
         lines: dict[int, Ends | None] = {}
@@ -156,6 +160,7 @@ def _replaced(model: Model, values: Mapping[int, Sequence[float]], count: int) -
     rows = list(dict.fromkeys(tuple(row) for row in values.values() if count == 1 or len(set(row)) > 1))
     if not rows:
         raise Unproved(f"time alone decides no jump of the dynamics at the ends of {count} pieces")
+    model.budget.spend(len(rows) * len(values) * (100 + 10 * count))
     nodes: list[Node] = []
     place: list[int] = []
 

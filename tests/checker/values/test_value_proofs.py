@@ -190,7 +190,9 @@ def test_patches_have_the_stated_derivatives() -> None:
     one = np.stack([np.sin(axes[0]), np.cos(axes[0]), -np.sin(axes[0])], axis=1)
     two = np.stack([np.cos(2 * axes[1]), -2 * np.sin(2 * axes[1]), -4 * np.cos(2 * axes[1])], axis=1)
     values = np.exp(times)[:, None, None, None, None] * one[None, :, :, None, None] * two[None, None, None]
-    patches = Surface(times, axes, values, values).patches(0, 2)
+    surface = Surface(times, axes, values, values)
+    (block,) = surface.blocks()
+    patches = surface.patches(*block)
     which = tm.terms(3, 13)
     for orders, exact_one in (
         ((0, 0, 0), lambda t, x, y: np.exp(t) * np.sin(x) * np.cos(2 * y)),
