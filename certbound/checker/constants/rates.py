@@ -14,7 +14,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix
 from certbound.checker.expressions import Graph, Program, Undecided, is_partial
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, Budget, Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.problem.model import JUMPS, Tape
 
@@ -81,6 +81,7 @@ class Contraction:
                 wide.append((form * value.lower(), form * value.upper()))
             if 2 ** len(wide) > MOST_VERTICES:
                 raise Unproved(f"the Jacobian has {len(wide)} independent parts or more, too many to try every vertex")
+        self.budget.expect((n * n * n // 3 * BALL) << len(wide))
         for choice in itertools.product((0, 1), repeat=len(wide)):
             self.budget.products(n, n, 2 * n + len(wide) + 8)
             jacobian = base

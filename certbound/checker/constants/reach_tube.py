@@ -18,7 +18,7 @@ from flint import arb, arb_mat
 from certbound.checker.balls import cholesky, column, largest_eigenvalue, magnitude
 from certbound.checker.constants.kummer import growth_integral
 from certbound.checker.expressions import Program, Undecided, expand
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import PRODUCT, Budget, Unproved
 from certbound.checker.statement import Model, Structure
 
 ORDER = 6
@@ -256,6 +256,8 @@ class Tube:
 
     def prove(self, start: arb, slope: arb, eta: Sequence[arb], radii: Sequence[arb]) -> None:
         """Prove that the stated defects and radii hold."""
+        n, many = self.model.dimension, 1 << len(self.reach) if len(self.reach) <= CORNERS else 1
+        self.budget.expect(len(eta) * many * 2 * n * n * PRODUCT)
         rho = start
         for k, piece in enumerate(self.pieces):
             self.budget.balls(80 + 4 * piece.work)

@@ -181,6 +181,7 @@ class _Proof:
         node = room if self.above else graph.neg(room)
         balance = Ceiling(graph, node, [flow, square], count=count + 1, budget=self.budget)
         noise = Ceiling(graph, graph.neg(square), [square], count=count + 1, budget=self.budget)
+        self.budget.expect(len(self.slopes) * balance.work)
         zero = (arb(0), arb(0))
         pushes = [(arb(low), arb(high)) for low, high in model.disturbance]
         tiny = -arb(2) ** -900

@@ -68,6 +68,11 @@ class Ceiling:
         for program in (self._thin, self._wide, self._slopes, self._range):
             program.prepare([])
 
+    @property
+    def work(self) -> int:
+        """Units of work of one look at a box, at least."""
+        return self._thin.work
+
     def prove(
         self, box: Sequence[Side], bound: arb, skip: Callable[[Sequence[arb], Sequence[arb]], bool] = lambda *_: False,
         member: Callable[[Sequence[arb], Sequence[arb]], bool] = lambda *_: True,

@@ -46,6 +46,11 @@ class Expansion:
         self._early = [number for number, index in enumerate(order) if not graph.masks[index] & below]
         self._first = [number for number, index in enumerate(order) if graph.masks[index] & below == 1]
         self._later = [number for number, index in enumerate(order) if graph.masks[index] & below > 1]
+        early = set(self._early)
+        self.work = sum(  # of its parameters and of one box, at least
+            STEP + (1 if number in early else 2) * work_of(op, 0) for number, (op, *_) in enumerate(self._nodes)
+            if op not in ("input", "const")
+        )
         self._output, self._guard = place[node], place[guard]
         self._template: list[Model | None] = []
         self._last: tuple[arb, dict[int, arb]] | None = None

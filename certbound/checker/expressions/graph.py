@@ -173,13 +173,19 @@ class Graph:
         if not self.masks[index] & bit:
             return self.const(0.0)
         known = self._derivatives
-        if (index, slot) in known:
-            return known[index, slot]
-        for place in self.reachable([index]):
-            if self.masks[place] & bit and (place, slot) not in known:
-                self.budget.check()
-                self.budget.hold(2)
-                known[place, slot] = self._rule(place, slot)
+        stack = [index]
+        while stack:  # what is known already is not looked at again
+            place = stack[-1]
+            node = self.nodes[place]
+            due = [arg for arg in node.args if self.masks[arg] & bit and (arg, slot) not in known] if (
+                node.op != "input" and (place, slot) not in known) else []
+            self.budget.spend(STEP + _EDGE * len(node.args))
+            stack.extend(due)
+            if not due:
+                stack.pop()
+                if (place, slot) not in known:
+                    self.budget.hold(2)
+                    known[place, slot] = self._rule(place, slot)
         return known[index, slot]
 
     def _known(self, index: int, slot: int) -> int:

@@ -84,6 +84,11 @@ class Program:
             return number, lambda x: ball(x, value), args[0], -1
         return number, ball, args[0], args[1] if len(args) == 2 else -1
 
+    @property
+    def work(self) -> int:
+        """Units of work of a run, at 128 bits."""
+        return self._work[1] + STEP + self._size
+
     def prepare(self, parameters: Sequence[arb]) -> None:
         """Set the parameters (inputs ``variables``, ``variables + 1``, ...)."""
         self._budget.balls(1, self._work[0] + STEP + self._size)
@@ -105,7 +110,7 @@ class Program:
 
         Undecided where a jump is undecided or something is undefined somewhere in the balls.
         """
-        self._budget.balls(1, self._work[1] + STEP + self._size)
+        self._budget.balls(1, self.work)
         values = self._template.copy()
         for number, slot in self._inputs:
             if slot < self.variables:

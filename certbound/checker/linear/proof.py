@@ -38,7 +38,7 @@ from certbound.checker.linear.samplers import raised
 from certbound.checker.linear.shared import Shared
 from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.reading import entries as listed
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import PRODUCT, Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, structure_of
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
@@ -165,6 +165,7 @@ class _Cell:
 
     def probability(self, outputs: Sequence[OutputRemainder]) -> arb:
         """Upper bound of the probability that this cell's paths break a constraint."""
+        self.budget.expect(self.shared.count * sum(output.expansion.work for output in outputs))
         self.pieces = self._pieces()
         n = self.model.dimension
         self.budget.products(len(self.pieces), n, n, 2 * n + 12)
@@ -231,6 +232,8 @@ class _Cell:
         result = []
         jacobian = shared.structure.states
         n = self.model.dimension
+        if self.model.continuous and self.shared.sampler is None:
+            self.budget.expect(self.shared.count * math.prod(work_of_piece(n)) * PRODUCT)
         for k, (slope, drifts) in enumerate(zip(map(jacobian.matrix, self.slopes), self.drifts)):
             self.budget.products(*(work_of_piece(n) if self.model.continuous else (n, n, 8)))
             noise = fixed if state is None else state.noise(k)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from flint import arb, arb_mat, ctx
 
 from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import PRODUCT, Budget, Unproved
 
 _TERMS = 60
 """Of a series at the precision of a check; more at higher ones."""
@@ -218,6 +218,7 @@ def supports(
     size: list[list[arb]] = [[] for _ in rows]
     pairs = [(node, row) for node, own in enumerate(rows) for row in own]
     most = max(1, min(_ROWS, int(_BLOCK / (n * n))))
+    budget.expect(sum(node * n * n for node, _ in pairs) * PRODUCT)
     for first in range(0, len(pairs), most):
         part = pairs[first : first + most]
         centre, spread = _carried(part, transitions, columns, start, budget)

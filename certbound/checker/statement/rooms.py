@@ -10,7 +10,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import column
 from certbound.checker.expressions import Graph, Program, Undecided
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, PRODUCT, Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint, Region
 from certbound.errors import CertificateError
@@ -96,6 +96,7 @@ def _demand(
     centres = centres_of(region, grid, budget)
     asked = grid.asked(constraint.during)
     found = []
+    budget.expect(sum(asked) * len(families) * model.dimension * BALL)
     for family in families:
         budget.hold(2 * count)
         found.append(Demand(label=constraint.label, rows=_lifted(region, family, model.dimension, budget), rooms=[]))
@@ -141,6 +142,7 @@ def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]
         image, bound = region.image(model.dimension, budget)
         asked, centres = grid.asked(constraint.during), centres_of(region, grid, budget)
         budget.hold(len(grid.times))
+        budget.expect(sum(asked) * image.nrows() * image.ncols() * PRODUCT)
         rooms: list[arb | None] = []
         for k in range(len(grid.times)):
             budget.check()

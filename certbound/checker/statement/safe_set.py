@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from flint import arb
 
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
 from certbound.checker.statement.rooms import Grid, centres_of
@@ -123,6 +123,11 @@ class StepSet:
         shapes = [_shape_of(c, centres_of(c.region, now, budget)[0], model.dimension, budget) for c in asked]
         self._shapes = [shape for shape in shapes if shape is not None]
         self._budget, self._size = budget, _size(self._shapes)
+
+    @property
+    def work(self) -> int:
+        """Units of work of one look at a box."""
+        return self._size * BALL
 
     def holds(self, box: Sequence[Side], *, strictly: bool = False) -> bool:
         """Whether no point of a box breaks a constraint; ``strictly``: an obstacle must not be touched either."""

@@ -57,6 +57,8 @@ class Crossing(Passage):
 
     def crossed(self, stages: Sequence[Crossing]) -> arb:
         """The same over stages that follow each other, this one being the first; all are lowered."""
+        for stage in stages:
+            stage._expect()
         ceiling = max(stage.ceiling() for stage in stages)
         for stage in stages:
             stage.stopped = ceiling
@@ -74,6 +76,13 @@ class Crossing(Passage):
         kept = arb(ceiling).exp()
         left = found - most * arb(start).exp() * rest
         return arb.max((left - kept) / (1 - kept), arb(0)).lower()
+
+    def _expect(self) -> None:
+        """Refuse more patches than can be looked at, each of them once by the dynamics."""
+        if self.due is None:
+            which = terms(self._variables(), self.degrees[0], self.budget)
+            patches = (len(self.surface.times) - 1) * math.prod(self.surface.cells)
+            self.budget.expect(which.numbers(patches) * len(self.model.dynamics.nodes))
 
     def ceiling(self) -> float:
         """At least V where a path ends that has not failed."""

@@ -46,6 +46,8 @@ MOST_CELLS = 100_000
 MOST_PARTS = 4096
 MOST_STEPS = 2_000
 _MOST_ZONES = 8
+_PER_OPERATION = 3_000
+"""Units of work of an operation of a tape on a batch, at least."""
 _LOST = 1e-3  # of the largest probability of being safe: cells with less count as failed
 
 
@@ -152,6 +154,9 @@ class _Discrete:
             first = StepSet(replace(self.model, constraints=limits), 0, self.budget)
             if not all(first.holds(box, strictly=True) for box in self.starts):
                 raise Unproved("the initial set was not shown to lie in the safe set")
+        if not self.steps.steady:
+            parts = len(self.steps.disturbances)
+            self.budget.expect((self.last - self.first) * parts * len(self.model.dynamics.nodes) * _PER_OPERATION)
         stays, value, arrived = self.model.stays, None, None
         for t in range(self.last, self.first - 1, -1):
             if stays and t >= self.window[0]:

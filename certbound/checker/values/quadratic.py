@@ -27,7 +27,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import identity, is_positive_definite, largest_eigenvalue, matrix, upper
 from certbound.checker.reading import Record, entries, numbers, unpacked, whole, wholes
-from certbound.checker.report import FUNCTION, Budget, Unproved
+from certbound.checker.report import FUNCTION, PRODUCT, Budget, Unproved
 from certbound.checker.statement import Model
 from certbound.checker.values.second_order import Flow, Local
 from certbound.checker.values.walls import Key, Surroundings, Wall
@@ -246,6 +246,8 @@ class _Value:
         around = self.around
         gains = self.flow.gain(around.center, around.width)
         n, many = self.n + 1, 2 + len(self.held) + self.flow.q - self.n
+        points = len(self.cells) * (self.degree + 1) * (len(self.times) - 1) << self.corners
+        self.budget.expect(points * n * n * 4 * (self.flow.columns + n) * PRODUCT)
         self.budget.hold(len(self.cells) * many * n * n)
         locals_ = [self.flow.over(low, high, self.held, around.center, around.width) for low, high in self.cells]
         steps = [b - a for a, b in pairwise(self.times)]

@@ -341,6 +341,7 @@ def zones(grid: Grid, model: Model, step: int, budget: Budget, *, strictly: bool
     if counts(model, step):
         target = StepSet(replace(model, constraints=(target_of(model),)), step, budget)
         done, undone = _decided(target.holds, boxes, budget), _decided(target.excludes, boxes, budget)
+    budget.expect(2 * len(boxes) * allowed.work)
     safe = _decided(partial(allowed.holds, strictly=strictly), boxes, budget)
     unsafe = _decided(allowed.excludes, boxes, budget)
     return Zones(safe, unsafe, done, undone, _decided(inside.holds, boxes, budget))
