@@ -33,7 +33,7 @@ class Expansion:
     def __init__(self, graph: Graph, node: int, guard: int, *, variables: int) -> None:
         self.variables, self._budget = variables, graph.budget
         order = graph.reachable([node, guard])
-        self._budget.spend(STEP * len(order))
+        self._budget.spend(5 * STEP * len(order))
         self._budget.hold(sum(4 + graph.bits[index] // 512 for index in order))
         self._bits = [graph.bits[index] for index in order]
         place = {index: number for number, index in enumerate(order)}

@@ -19,8 +19,8 @@ _NODE = 6
 """Memory of a node, in balls."""
 _MANY = 1000
 """Edges between two looks at the budget."""
-_EDGE = 300
-"""Units of work of an edge on the way through a graph."""
+_NODE_WORK, _EDGE = 5 * STEP, 600
+"""Units of work of a node that is made, 3 to 6 us, and of an edge on the way through a graph."""
 _PRODUCTS = frozenset(["mul", "sq", "div", "hypot", "atan2"])
 _SUMS = frozenset(["add", "sub", "neg", "abs", "min", "max", "kink", "if_else_zero", "sqrt"])
 _BITS, _FLOAT, _POWER = 512, 12, 14
@@ -67,7 +67,7 @@ class Graph:
             for arg in args:
                 mask |= self.masks[arg]
                 bits = max(bits, self.bits[arg])
-        self.budget.spend(STEP + mask.bit_length() // 8 + _EDGE * len(args))
+        self.budget.spend(_NODE_WORK + mask.bit_length() // 8 + _EDGE * len(args))
         self.budget.hold(_NODE + mask.bit_length() // 512)
         self.masks.append(mask)
         self.bits.append(longer(op, bits))
@@ -179,7 +179,7 @@ class Graph:
             node = self.nodes[place]
             due = [arg for arg in node.args if self.masks[arg] & bit and (arg, slot) not in known] if (
                 node.op != "input" and (place, slot) not in known) else []
-            self.budget.spend(STEP + _EDGE * len(node.args))
+            self.budget.spend(3 * STEP + _EDGE * len(node.args))
             stack.extend(due)
             if not due:
                 stack.pop()

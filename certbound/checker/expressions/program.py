@@ -48,7 +48,7 @@ class Program:
         self._special: dict[str, Callable[..., arb]] = {"kink": generalised_kink} if generalised else {}
         watched = sorted(set(guards))
         order = graph.reachable([*outputs, *watched])
-        self._budget.spend(STEP * len(order))
+        self._budget.spend(5 * STEP * len(order))
         self._budget.hold(sum(4 + graph.bits[index] // _WORD for index in order))
         place = {index: number for number, index in enumerate(order)}
         below = (1 << variables) - 1

@@ -10,7 +10,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import column
 from certbound.checker.expressions import Graph, Program, Undecided
-from certbound.checker.report import BALL, PRODUCT, Budget, Unproved
+from certbound.checker.report import BALL, BALL_BYTES, PRODUCT, STEP, Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint, Region
 from certbound.errors import CertificateError
@@ -61,6 +61,7 @@ def demands(
     """
     if len(separations) != len(model.constraints):
         raise CertificateError(f"`{path}` must have {len(model.constraints)} entries, got {len(separations)}.")
+    budget.expect(len(model.constraints) * len(grid.times) * STEP)
     result: list[Demand] = []
     for number, (constraint, given) in enumerate(zip(model.constraints, separations)):
         if polygons or not (constraint.inside and constraint.region.round):
@@ -89,6 +90,7 @@ def _demand(
         budget.take(8 * len(pairs) * count)
         families = [[pair] * count for pair in pairs]
     else:
+        budget.fits((8 + 2 * BALL_BYTES) * len(region.bounds) * count)
         budget.take(8 * len(region.bounds) * count)
         families = [
             [(region.face(number), arb(b))] * count for number, b in enumerate(region.bounds)
@@ -103,7 +105,7 @@ def _demand(
     for k in range(count):
         points = grid.points(k, constraint.during) if asked[k] else []
         for family, demand in zip(families, found):
-            budget.balls((1 + len(points)) * (4 + len(demand.rows[k])))
+            budget.balls((1 + len(points)) * (10 + 2 * len(demand.rows[k])))
             row, bound = family[k]
             offset = bound + _dot(row, centres[k])
             rooms = [offset - _dot(demand.rows[k], point) for point in points]

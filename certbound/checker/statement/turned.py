@@ -204,6 +204,7 @@ class _Writer:
         for node in tape.nodes:
             own = given if node.op == "input" else found
             self.budget.take(_NODE_BYTES)
+            self.budget.spend(2 * _FRACTION + _NODE_WORK)
             found.append(self._value(node, [own[arg] for arg in node.args]))
         return [found[output] for output in tape.outputs]
 

@@ -151,11 +151,13 @@ class PieceTransition(Transition):
     def _mean(self, extremes: _Extremes, part: int) -> Array:
         upper = self.steps.upper
         total = np.zeros(self.count)
+        gains = self.gains[0].size if self._keeps else 2 * self.gains[0].size
+        work = 12 * gains + 200 * self.count
+        self.steps.budget.expect(len(self.pieces.most) * work)
+        self.steps.budget.fits(8 * 8 * gains)
         for k, weight in enumerate(self.pieces.most if upper else self.pieces.least):
             if weight > 0:
-                gains = self.gains[0].size if self._keeps else 2 * self.gains[0].size
-                self.steps.budget.fits(8 * 8 * gains)
-                self.steps.budget.floats(12 * gains + 200 * self.count, 40)
+                self.steps.budget.floats(work, 40)
                 total += weight * extremes.over(*self._met(part, k))
         return np.where(self.lost[part], 1.0 if upper else 0.0, total)
 
