@@ -11,7 +11,6 @@ import json
 import os
 import resource
 import sys
-import time
 import zlib
 from collections.abc import Callable
 from functools import partial
@@ -186,7 +185,7 @@ def response(states: int, pieces: int, *, discrete: bool, **parts: Any) -> Data:
 
 @bomb("a slab of 360,000 patches", WORK)
 def _() -> Data:
-    dynamics = tape(2, *[["const", ONE]] * 9000)
+    dynamics = tape(2, *[["const", ONE]] * 16_000)
     return file(problem(2, dynamics=dynamics), surface([600, 600], lower=True), lower=True)
 
 
@@ -443,11 +442,23 @@ def barrier(states: int, **parts: Any) -> Data:
     }
 
 
-@bomb("boxes over a long tape", WORK)
+@bomb("boxes on which a sum that is 0 is never seen to be", WORK)
 def _() -> Data:
-    dynamics = chain("sin", 20_000)
-    about = problem(1, dynamics={"nodes": [*dynamics["nodes"], ["mul", 0, 20_000]], "outputs": [20_001]})
-    return file(about, barrier(1, growth=hexed(1.0 + 2.0**-30)))
+    """f = K (sin^2 + cos^2 - 1) sin(sin(...)) - x, for which the generator of |x|^2 is the number of states."""
+    n, length = 6, 2_000
+    nodes: list[list[Any]] = [["input", 1 + i] for i in range(n)]
+    nodes += [["const", hexed(1e9)], ["const", "-0x1.0p+0"]]
+    outputs = []
+    for i in range(n):
+        first = len(nodes)
+        nodes += [["sin", i], ["cos", i], ["sq", first], ["sq", first + 1], ["add", first + 2, first + 3]]
+        nodes += [["add", first + 4, n + 1], ["mul", first + 5, n], ["sin", i]]
+        nodes += [["sin", first + 7 + k] for k in range(length)]
+        last = len(nodes) - 1
+        nodes += [["mul", first + 6, last], ["sub", last + 1, i]]
+        outputs.append(len(nodes) - 1)
+    about = problem(n, dynamics={"nodes": nodes, "outputs": outputs})
+    return file(about, barrier(n, growth=hexed(n + 2.0**-30)))
 
 
 @bomb("a barrier whose generator is no end of operations", "more than 400000 operations")
@@ -518,15 +529,14 @@ def _() -> Data:
     return file(about, constants(n, 2, assumed=False, metric=metric))
 
 
-@bomb("hypergeometric functions on 6,000 pieces", WORK)
+@bomb("sections of a thousand balls in 95 states", WORK)
 def _() -> Data:
-    pieces = 6_000
-    times = [k / 2**13 for k in range(pieces)] + [1.0]
-    about = problem(1, constraints=[box(1, 8.0)])
-    proof = constants(1, pieces, times, rate=hexed(1.0), sigma=hexed(1.5), rooms=[hexed(4.0)] * pieces)
-    proof["kummer"] = {"form": "kummer", "a": hexed(2e3), "v0": hexed(1e-3)}
-    proof["cells"][0]["eta"] = [hexed(1e-3)] * pieces
-    proof["cells"][0]["radius"] = [hexed(3.0)] * pieces
+    n, count = 95, 1_000
+    ball = {"kind": "ball", "center": None, "radius": hexed(100.0), "coordinates": None}
+    about = problem(n, steps=1.0, noise=single(n))
+    about["constraints"] = [{"kind": "inside", "region": ball, "during": None, "label": ""}] * count
+    proof = constants(n, 2)
+    proof["cells"][0]["separations"] = [None] * count
     return file(about, proof)
 
 
@@ -649,9 +659,9 @@ def main() -> None:
     import certbound.checker.values  # noqa: F401  # loaded once, for all
 
     for line in sys.stdin:
-        started = time.monotonic()
         name, seconds = json.loads(line)
-        print(json.dumps(alone(name, seconds) | {"wall": time.monotonic() - started}), flush=True)
+        sys.stdout.write(json.dumps(alone(name, seconds)) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

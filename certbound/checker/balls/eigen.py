@@ -8,6 +8,8 @@ from certbound.checker.balls.matrices import identity, is_positive_definite, mat
 from certbound.checker.report import Budget, Unproved
 
 _HALVINGS = 60
+FEWEST_HALVINGS = 40
+"""Matrices that are looked at for the `largest_eigenvalue` of one that is not 0 and has more than one row, at least."""
 
 
 def cholesky(a: arb_mat, budget: Budget | None = None) -> arb_mat:
@@ -45,7 +47,7 @@ def largest_eigenvalue(a: arb_mat, budget: Budget | None = None) -> arb:
     low, high = arb(0), top
     one = identity(n)
     for _ in range(_HALVINGS):
-        if high - low <= high * arb(2) ** -40:
+        if high - low <= high * arb(2) ** -FEWEST_HALVINGS:
             break
         middle = ((low + high) / 2).mid()
         if is_positive_definite(one * middle - a, budget):

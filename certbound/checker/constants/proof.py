@@ -14,12 +14,12 @@ from itertools import pairwise
 
 from flint import arb, arb_mat
 
-from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix
+from certbound.checker.balls import FEWEST_HALVINGS, cholesky, identity, is_positive_definite, matrix
 from certbound.checker.constants.kummer import MOST_POWER, Kummer, exit_probability
 from certbound.checker.constants.rates import Contraction, Spread
 from certbound.checker.constants.reach_tube import CurvePiece, Norm, Tube
 from certbound.checker.reading import Record, entries, number
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, round_demands, structure_of
 from certbound.errors import CertificateError
 
@@ -165,7 +165,10 @@ class _Proof:
                 if id(row) not in duals:
                     duals[id(row)] = self.norm.dual(row)
             asked.append((demand.label, demand.rooms, [duals[id(row)] for row in demand.rows]))
-        for ball in round_demands(self.model, grid, self.budget):
+        rounds = round_demands(self.model, grid, self.budget)
+        sizes = [ball.image.nrows() for ball in rounds]
+        self.budget.expect(sum(k * k * k // 3 for k in sizes if k > 1) * FEWEST_HALVINGS * BALL)
+        for ball in rounds:
             asked.append((ball.label, ball.rooms, [self.norm.section(ball.image)] * self.count))
         random = self.model.initial.covariance is not None
         for label, rooms, lengths in asked:
