@@ -10,18 +10,20 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from flint import arb, ctx
 
-from certbound.checker import parse
+from certbound.checker import check_data, claims, parse
 from certbound.checker.check import SECONDS
 from certbound.checker.expressions import Graph, Program
 from certbound.checker.expressions.arithmetic import cos, sin, sin_cos, tan
 from certbound.checker.report import BALL, BALL_BYTES, SECOND, STEP, Budget, Unproved
+from certbound.checker.statement import turned
 from certbound.checker.statement.tapes import canonical
 from certbound.checker.values import batches as tm
 from certbound.checker.values.hermite import Surface
-from tests.checker.bombs import BOMBS, MOST_BYTES, WORK, content
+from tests.checker.bombs import BOMBS, MOST_BYTES, ONE, WORK, ZERO, barrier, content, file, hexed, problem
 
 ROOT = Path(__file__).resolve().parents[2]
 Check = Callable[[str, float], dict[str, Any]]
@@ -183,8 +185,6 @@ def test_tables_of_monomials_are_made_once_in_a_check() -> None:
 
 
 def test_blocks_of_a_surface_are_all_of_its_patches_once() -> None:
-    import numpy as np
-
     rng = np.random.default_rng(0)
     for cells in ((3, 5), (90, 70), (2, 9000), (9000, 2), (7000,)):
         axes = tuple(np.sort(rng.random(count + 1)) for count in cells)
@@ -198,8 +198,6 @@ def test_blocks_of_a_surface_are_all_of_its_patches_once() -> None:
 
 
 def test_cells_that_are_chosen_are_those_of_all_patches() -> None:
-    import numpy as np
-
     rng = np.random.default_rng(1)
     axes = (np.sort(rng.random(5)), np.sort(rng.random(4)))
     surface = Surface(np.array([0.0, 1.0]), axes, rng.random((2, 5, 3, 4, 3)), rng.random((2, 5, 3, 4, 3)))
@@ -218,6 +216,27 @@ def test_a_network_of_many_inputs_is_put_in_order_in_one_go() -> None:
     nodes, outputs = canonical(data)
     assert [node[:2] for node in nodes[:3]] == [["input", 299], ["input", 298], ["input", 297]]
     assert outputs == [300]
+
+
+def test_a_model_in_other_coordinates_is_made_once_for_all_members_that_take_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, compose = [], turned._composed
+    monkeypatch.setattr(turned, "_composed", lambda *given: made.append(1) or compose(*given))
+    same = {"engine": "coordinates", "matrix": hexed([[2.0]]), "inverse": hexed([[0.5]]), "proof": barrier(1)}
+    start = problem(1)["initial"]
+    about = problem(1, initial={"kind": "union", "members": [start] * 3}, noise={"law": "wiener", "diffusion": [[ONE]]})
+    check_data(file(about, {"engine": "union", "members": [same] * 3}))
+    assert len(made) == 1
+
+
+def test_probabilities_of_cells_are_computed_once_in_a_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, weigh = [], claims.weights_of
+    monkeypatch.setattr(claims, "weights_of", lambda *given: asked.append(1) or weigh(*given))
+    drawn = {"d0": {"law": "uniform", "level": "halfwidth", "value": hexed(0.1), "mean": ZERO}}
+    cells = [{"low": hexed([-0.1]), "high": hexed([0.1]), "proof": barrier(1)}]
+    check_data(file(problem(1, pushes=1, random=drawn), {"engine": "random", "cells": cells}))
+    assert len(asked) == 1
 
 
 def test_the_files_are_read_as_they_are_written() -> None:
