@@ -136,7 +136,7 @@ class Crossing(Passage):
 
     def _at_end(self) -> float:
         """At least V at the horizon."""
-        return float(np.nextafter(_most(self.finally_()[1]) + self.lift, np.inf))
+        return float(np.nextafter(_most(self.last_ends()[1]) + self.lift, np.inf))
 
     def _on(self, axis: int, end: int) -> float:
         """At least V on a side of the grid."""

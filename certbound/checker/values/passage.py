@@ -266,9 +266,9 @@ class Passage:
 
     def _at_end(self) -> float:
         """At most V at the horizon."""
-        return float(np.nextafter(self.finally_()[0].min() + self.lift, -np.inf))
+        return float(np.nextafter(self.last_ends()[0].min() + self.lift, -np.inf))
 
-    def finally_(self) -> tuple[Array, Array]:
+    def last_ends(self) -> tuple[Array, Array]:
         """Ends of V, before it is lifted, on all cells at the end, in their shape."""
         n, last = self.model.dimension, self.surface.frozen(-1)
         which, low, high = terms(n + 1, 5 + 3 * (n - 1), self.budget), np.empty(last.cells), np.empty(last.cells)

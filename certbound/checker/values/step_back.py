@@ -79,7 +79,8 @@ class Values:
     @property
     def size(self) -> int:
         """Numbers in its `pieces`."""
-        return (DEGREE + 1) ** len(self.grid.edges) * math.prod(count + 2 for count in self.grid.shape)
+        powers: int = (DEGREE + 1) ** len(self.grid.edges)
+        return powers * math.prod(count + 2 for count in self.grid.shape)
 
     def pieces(self) -> Array:
         """Coefficients by exponents and cells, with the outer cells, shape (degree + 1, ..., cells + 2, ...)."""

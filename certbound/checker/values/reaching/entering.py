@@ -167,7 +167,7 @@ class _FailingAbove(Passage):
         return _window(self.model)
 
     def _missing(self) -> float:
-        least = float(_known(self.finally_()[0][~self.ended.over]).min())
+        least = float(_known(self.last_ends()[0][~self.ended.over]).min())
         for axis, end in itertools.product(range(self.model.dimension), (0, 1)):
             beside = self.ended.beside(axis, end)
             if beside.any():
