@@ -17,9 +17,8 @@ import zlib
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
-from certbound.checker.report import Budget
 from certbound.errors import CertificateError
 
 LARGEST_FILE = 16 * 2**20
@@ -32,6 +31,13 @@ _PER_NUMBER = 2_000
 _BLOCK = 2**18
 """Bytes that are unpacked at once."""
 _NUMBER = re.compile(r"-?0x[01]\.[0-9a-f]{1,13}p[+-][0-9]{1,4}\Z")
+
+
+class Counter(Protocol):
+    """What counts memory and work before they are taken and done: ``report.Budget``."""
+
+    def take(self, size: int) -> None: ...
+    def spend(self, units: int) -> None: ...
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -229,7 +235,7 @@ def text(value: object, path: str, longest: int) -> str:
     return value
 
 
-def unpacked(value: object, path: str, count: int, budget: Budget) -> array[float]:
+def unpacked(value: object, path: str, count: int, budget: Counter) -> array[float]:
     """Numbers with single spaces between them, compressed and written in base 64.
 
     Nothing beyond what so many numbers need is ever unpacked, however small the text, and never more than a block of it
