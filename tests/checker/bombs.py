@@ -570,7 +570,7 @@ def _() -> Data:
     return file(about, proof)
 
 
-@bomb("rows of every piece through all pieces before it", WORK)
+@bomb("rows of every piece through all pieces before it", MEMORY)
 def _() -> Data:
     steps, count = 4_000, 900
     wall = {"kind": "halfspace", "normal": [ONE], "bound": ONE}

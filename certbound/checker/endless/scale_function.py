@@ -28,7 +28,7 @@ from typing import Any
 
 from flint import arb, fmpq, fmpq_poly
 
-from certbound.checker.expressions import Ceiling, Graph, Side, lives
+from certbound.checker.expressions import Ceiling, Graph, Side
 from certbound.checker.reading import Record
 from certbound.checker.report import FUNCTION, Budget, Unproved
 from certbound.checker.statement import Constraint, Model
@@ -294,7 +294,7 @@ def _polynomial(tape: Tape, state: fmpq_poly, budget: Budget) -> list[fmpq_poly]
     """A tape's outputs as polynomials, exactly; Unproved where they are none."""
     values: list[Any] = []
     sizes: list[tuple[int, int]] = []
-    ended, _ = lives(tape)
+    ended, _ = tape.lives()
     for node, over in zip(tape.nodes, ended):
         args = [] if node.op == "input" else [values[arg] for arg in node.args]
         _count(node, [] if node.op == "input" else [sizes[arg] for arg in node.args], budget)

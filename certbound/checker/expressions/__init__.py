@@ -7,10 +7,10 @@ from certbound.checker.expressions.ceiling import Ceiling, Side
 from certbound.checker.expressions.expansion import Expansion
 from certbound.checker.expressions.graph import Graph
 from certbound.checker.expressions.operations import OPERATIONS, is_partial
-from certbound.checker.expressions.program import Program, expand, lives
+from certbound.checker.expressions.program import Program, expand
 from certbound.checker.expressions.quadratic import Cut, Quadratic
 
 __all__ = [
-    "Ceiling", "Cut", "expand", "Expansion", "Graph", "is_partial", "lives", "OPERATIONS", "Program", "Quadratic",
-    "Side", "Undecided",
+    "Ceiling", "Cut", "expand", "Expansion", "Graph", "is_partial", "OPERATIONS", "Program", "Quadratic", "Side",
+    "Undecided",
 ]  # fmt: skip

@@ -164,23 +164,3 @@ def _expanded(tape: Tape, inputs: Sequence[Series], order: int, budget: Budget) 
     if not all(c.is_finite() for series in result for c in series):
         raise Undecided
     return result
-
-
-def lives(tape: Tape) -> tuple[list[list[int]], int]:
-    """The values that each operation is the last to need, and how many are there at once at most."""
-    last = list(range(len(tape.nodes)))
-    for index, node in enumerate(tape.nodes):
-        for arg in () if node.op == "input" else node.args:
-            last[arg] = index
-    for output in tape.outputs:
-        last[output] = len(tape.nodes)
-    ended: list[list[int]] = [[] for _ in tape.nodes]
-    for place, index in enumerate(last):
-        if index < len(tape.nodes):
-            ended[index].append(place)
-    there = most = 0
-    for places in ended:
-        there += 1
-        most = max(most, there)
-        there -= len(places)
-    return ended, most

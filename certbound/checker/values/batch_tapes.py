@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from flint import arb
 
-from certbound.checker.expressions import OPERATIONS, Undecided, lives
+from certbound.checker.expressions import OPERATIONS, Undecided
 from certbound.checker.report import FUNCTION, STEP
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Batch
@@ -20,7 +20,7 @@ def run(tape: Tape, inputs: Sequence[Batch]) -> list[Batch]:
     """The outputs of a tape on N boxes; unknown where an operation is undefined or jumps somewhere on a box."""
     values: list[Batch] = []
     like = inputs[0]
-    ended, most = lives(tape)
+    ended, most = tape.lives()
     like.terms.budget.spend(STEP * len(tape.nodes))
     like.terms.budget.fits(8 * (most + 8) * like.coefficients.size)
     nothing = tm.fixed(like.terms, np.zeros(0))

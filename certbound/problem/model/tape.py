@@ -103,6 +103,25 @@ class Tape:
                 values.append(arithmetic[node.op](*(values[arg] for arg in node.args)))
         return [values[output] for output in self.outputs]
 
+    def lives(self) -> tuple[list[list[int]], int]:
+        """The values that each operation is the last to need, and how many are there at once at most."""
+        last = list(range(len(self.nodes)))
+        for index, node in enumerate(self.nodes):
+            for arg in () if node.op == "input" else node.args:
+                last[arg] = index
+        for output in self.outputs:
+            last[output] = len(self.nodes)
+        ended: list[list[int]] = [[] for _ in self.nodes]
+        for place, index in enumerate(last):
+            if index < len(self.nodes):
+                ended[index].append(place)
+        there = most = 0
+        for places in ended:
+            there += 1
+            most = max(most, there)
+            there -= len(places)
+        return ended, most
+
     def describe(self, index: int) -> str:
         """The expression that node ``index`` stands for, for error messages (cut after 120 characters)."""
         text = self._expression(index, depth=6)
