@@ -87,7 +87,7 @@ def _about(
     breaks, place = [first, last], 0
     rows: list[dict[int, float | None]] = []
     while place + 1 < len(breaks):
-        values, jump = _values(tape, timed, *breaks[place : place + 2], budget)
+        values, jump = _values(tape, timed, breaks[place], breaks[place + 1], budget)
         if jump is None or len(breaks) > _MOST_BREAKS:
             rows.append(values)
             place += 1

@@ -185,7 +185,9 @@ def response(states: int, pieces: int, *, discrete: bool, **parts: Any) -> Data:
 
 @bomb("a slab of 360,000 patches", WORK)
 def _() -> Data:
-    dynamics = tape(2, *[["const", ONE]] * 16_000)
+    dynamics = tape(2, ["input", 1], *[["add", k, 0] for k in range(16_000)])
+    dynamics["nodes"].append(["add", 16_000, dynamics["outputs"][0]])
+    dynamics["outputs"][0] = len(dynamics["nodes"]) - 1
     return file(problem(2, dynamics=dynamics), surface([600, 600], lower=True), lower=True)
 
 
@@ -204,7 +206,7 @@ def _() -> Data:
 @bomb("values of an operation for every node", MEMORY)
 def _() -> Data:
     nodes = [["input", 1], *[["sin", 0]] * 20_000]
-    nodes += [["add", 1, 2], *[["add", 20_000 + k, k + 2] for k in range(1, 19_000)]]
+    nodes += [["add", 1, 2], *[["add", 20_000 + k, k + 2] for k in range(1, 19_999)]]
     about = problem(1, dynamics={"nodes": nodes, "outputs": [len(nodes) - 1]})
     return file(about, surface([600], 6, lower=True), lower=True)
 
@@ -341,7 +343,7 @@ def _() -> Data:
     nodes += [["mul", k, 2] for k in range(2, 60)]
     last = len(nodes) - 1
     nodes += [["add", last, k % 40 + 3] for k in range(24_000)]
-    total = [["add", last + 1, last + 2], *[["add", last + 24_000 + k, last + 2 + k] for k in range(1, 23_000)]]
+    total = [["add", last + 1, last + 2], *[["add", last + 24_000 + k, last + 2 + k] for k in range(1, 23_999)]]
     dynamics = {"nodes": nodes + total, "outputs": [len(nodes) + len(total) - 1]}
     about = lasting(dynamics)["problem"] | problem(1, steps=2.0, dynamics=dynamics, constraints=[above()])
     return file(about | {"horizon": None}, {
@@ -399,33 +401,30 @@ def _() -> Data:
 
 @bomb("jumps in time on a thousand pieces", WORK)
 def _() -> Data:
-    return file(problem(1, dynamics=stairs(12_000)), {"engine": "barrier", "jumps": 1000})
+    return file(problem(1, dynamics=stairs(4_000)), {"engine": "barrier", "jumps": 1000})
 
 
-def stairs(count: int, step: str = "lt") -> Data:
-    """The number of equal parts of the horizon that are over."""
+def stairs(count: int) -> Data:
+    """A sum of comparisons with time."""
     nodes: list[list[Any]] = [["input", 1], ["input", 0]]
     for k in range(count):
         last = len(nodes) - 1 if k else 0
-        nodes += [["const", hexed(k / 2**14)], [step, 1, len(nodes)], ["add", last, len(nodes) + 1]]
+        nodes += [["const", hexed(k / 2**14)], ["lt", 1, len(nodes)], ["add", last, len(nodes) + 1]]
     return {"nodes": nodes, "outputs": [len(nodes) - 1]}
 
 
 # ---- comparisons that rounding might decide -------------------------------------------------------------------
 
 
-@bomb("a comparison at a hundred thousand steps", WORK)
+@bomb("comparisons at a hundred thousand steps, of a hundred moving sets", WORK)
 def _() -> Data:
-    nodes: list[list[Any]] = [["input", 1], ["input", 0], ["mul", 1, 1]]
-    nodes += [["mul", 1, 1], ["add", 2, 3], *([op, len_, 1] for len_, op in zip(range(4, 24), ["mul", "add"] * 10))]
-    nodes += [["lt", len(nodes) - 1, 1], ["mul", 0, len(nodes)]]
-    about = problem(1, steps=100_000.0, dynamics={"nodes": nodes, "outputs": [len(nodes) - 1]})
-    return file(about, barrier(1))
-
-
-@bomb("as many comparisons as operations before them, at every step", WORK)
-def _() -> Data:
-    return file(problem(1, steps=10_000.0, dynamics=stairs(12_000)), barrier(1))
+    nodes: list[list[Any]] = [["input", 0], ["sq", 0]]
+    nodes += [[("mul", "add")[k % 2], k, 0] for k in range(1, 25)]
+    nodes += [["const", ONE], ["lt", len(nodes), len(nodes) - 1]]
+    center = {"nodes": nodes, "outputs": [len(nodes) - 1]}
+    ball = {"kind": "ball", "center": center, "radius": ONE, "coordinates": None}
+    moving = {"kind": "inside", "region": ball, "during": None, "label": ""}
+    return file(problem(1, steps=100_000.0, constraints=[moving] * 100), barrier(1))
 
 
 @bomb("comparisons of what reads 400 states", WORK)
@@ -462,8 +461,8 @@ def _() -> Data:
         nodes += [["network", 0, 0, *range(first, first + wide)] for _ in range(wide if level < 5 else 1)]
     small, top = hexed(2.0**-60), len(nodes) - 1
     nodes += [
-        ["const", small], ["mul", top, top + 1], ["const", hexed(0.1)], ["const", hexed(0.2)], ["add", top + 3, top + 4],
-        ["add", top + 5, top + 2], ["const", hexed(0.3)], ["lt", top + 6, top + 7],
+        ["const", small], ["mul", top, top + 1], ["const", hexed(0.1)], ["const", hexed(0.2)],
+        ["add", top + 3, top + 4], ["add", top + 5, top + 2], ["const", hexed(0.3)], ["lt", top + 6, top + 7],
     ]
     dynamics = {"networks": [layers], "nodes": nodes, "outputs": [len(nodes) - 1] * wide}
     about = problem(wide, steps=1.0, dynamics=dynamics, noise=single(wide))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 from certbound.display import rounded
 from certbound.errors import EnclosureError, InfeasibleError
@@ -148,7 +149,7 @@ def _by_rate(problem: Problem) -> EngineAnswer | None:
 
 
 def _failure(problem: Problem, limit: float, ratio: float) -> FailureBounds:
-    asked: dict[str, float] = {"seconds": limit, "delta": problem.delta, "ratio": ratio}
+    asked: dict[str, Any] = {"seconds": limit, "delta": problem.delta, "ratio": ratio}
     try:  # what noise along one direction leaves to chains otherwise
         found: FailureBounds | None = bound_directed_failure(problem, **asked)
     except InfeasibleError:
