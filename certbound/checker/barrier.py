@@ -116,6 +116,7 @@ class _Expressions:
         columns, entries = self._diffusion(model, slots[: n + 1])
         half = graph.const(0.5)
         for j in range(columns):
+            budget.check()
             column = [entries[i * columns + j] for i in range(n)]
             along = graph.sum(graph.mul(a, b) for a, b in zip(column, slope))
             if not graph.is_const(along, 0.0):

@@ -20,8 +20,9 @@ from certbound.errors import CertificateError
 FORMAT = "certbound certificate"
 VERSION = 1
 SECONDS = 300.0
-"""Time that a check may take."""
+"""Work and time that a check may take."""
 PRECISION = 128
+_UNREAD = "what the certificate claims was not read within the limits of the check"
 
 
 def check_file(
@@ -48,7 +49,7 @@ def check_data(
     problem : mapping, optional
         The ``problem`` part that the certificate must speak of, up to names for humans and the order of operations.
     seconds : float
-        Time limit.
+        Limit on the work, counted before it is done in seconds of a usual machine, and on the time.
     allow_assumptions : bool
         Whether ``valid`` is True also for what was proved under assumptions.
 
@@ -79,15 +80,15 @@ def check_data(
             raise CertificateError(f"`problem` cannot be read: {error}.") from error
         proof = record["proof"]
         engine_of(proof, method)
-        assumed = tuple(assumptions(model, proof, named))
-        check_side(model, proof, least is not None)
-        difference = "" if problem is None else first_difference(record["problem"], problem)
-        if problem is not None and not difference:
-            model = model.named_as(problem)
-        words = claim(model, proof, level, assumed) if least is None else claim_below(model, least, assumed)
-        answer = partial(_report, claim=words, level=level, least=least, assumed=assumed)
-        proved = None
+        answer, proved = partial(_report, claim=_UNREAD, level=level, least=least, assumed=()), None
         try:
+            assumed = tuple(assumptions(model, proof, named))
+            check_side(model, proof, least is not None)
+            difference = "" if problem is None else first_difference(record["problem"], problem)
+            if problem is not None and not difference:
+                model = model.named_as(problem)
+            words = claim(model, proof, level, assumed) if least is None else claim_below(model, least, assumed)
+            answer = partial(_report, claim=words, level=level, least=least, assumed=assumed)
             if difference:
                 raise Unproved(f"the certificate speaks of another problem: {shortened(difference, 200)}")
             proved = prove(model, proof, budget, lower=least is not None)

@@ -26,7 +26,7 @@ from certbound.checker.endless import (
 )
 from certbound.checker.linear import check_linear
 from certbound.checker.reading import Record, number, numbers, wholes
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import STEP, Budget, Unproved
 from certbound.checker.statement import Model, met_at, restated, weights_of
 from certbound.checker.time_pieces import jumps_of, with_time_pieces
 from certbound.checker.words import plainly, quoted, rounded
@@ -146,6 +146,7 @@ def _plain_parts(
     A target is met at one time, which the proof names. CertificateError where the start is a union, or there is a
     target, and the proof does not say so, or the other way round. In other coordinates the model is another one.
     """
+    model.budget.spend(50 * STEP)
     if model.stays and not _is_whole(model, proof) and not (model.members or model.drawn):
         raise CertificateError(f"`{path}.engine` must be \"values\" where a target is to be stayed in.")
     if model.members:
@@ -193,7 +194,9 @@ def _cells(
     ranges = [list(zip(record.array("low", count), record.array("high", count))) for record in records]
     if any(low > high for cell in ranges for low, high in cell):
         raise CertificateError(f"`{path}.cells` must have ends that rise.")
-    for record, cell, weight in zip(records, ranges, weights_of(model.drawn, ranges)):
+    # every pass over the parts asks for the weights
+    weights = model.budget.once(proof, (RANDOM, model.drawn), lambda: weights_of(model.drawn, ranges, model.budget))
+    for record, cell, weight in zip(records, ranges, weights):
         values = list(model.disturbance)
         for constant, ends in zip(model.drawn, cell):
             least, most = values[constant.place]

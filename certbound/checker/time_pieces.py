@@ -24,6 +24,9 @@ NEAR = Fraction(1, 2**48)
 """Share of the horizon by which a jump may miss the end of its piece."""
 _MOST_BREAKS = 40  # about one end
 _LARGEST, _LONGEST = 2**53, 4096  # a value of floor that is a float itself, and bits of a fraction
+_PER_LINE, _PER_BIT, _ENTRY = 20_000, 40, 150
+"""Units of work of an operation on a piece in fractions (2 to 20 us) and of every bit of its result, and bytes of what
+is kept of a jump on one."""
 _CHOICE = "if_else_zero"
 _OF_TRUTHS = frozenset(["and", "or", "not", _CHOICE])
 _TRUTHS = JUMPS - {_CHOICE, "sign", "floor"}
@@ -45,12 +48,12 @@ def with_time_pieces(model: Model, count: int, budget: Budget) -> Model:
     timed = _timed(tape)
     jumps = [index for index in timed if tape.nodes[index].op in JUMPS | _BENDS]
     ends, near = [horizon * k / count for k in range(count + 1)], horizon * NEAR
+    budget.expect((2 * count + 1) * (len(timed) + 1) * _PER_LINE)
     inside, about = [], []
     for k, end in enumerate(ends):
-        budget.check()
         about.append(_about(tape, timed, max(end - near, Fraction(0)), min(end + near, horizon), budget))
         if k < count:
-            inside.append(_values(tape, timed, end + near, ends[k + 1] - near)[0])
+            inside.append(_values(tape, timed, end + near, ends[k + 1] - near, budget)[0])
     courses = {}
     for index in jumps:
         rows = tuple(tuple(row[index] for row in own) for _, own in about)
@@ -84,8 +87,7 @@ def _about(
     breaks, place = [first, last], 0
     rows: list[dict[int, float | None]] = []
     while place + 1 < len(breaks):
-        budget.check()
-        values, jump = _values(tape, timed, *breaks[place : place + 2])
+        values, jump = _values(tape, timed, breaks[place], breaks[place + 1], budget)
         if jump is None or len(breaks) > _MOST_BREAKS:
             rows.append(values)
             place += 1
@@ -95,15 +97,17 @@ def _about(
 
 
 def _values(
-    tape: Tape, timed: Sequence[int], first: Fraction, last: Fraction
+    tape: Tape, timed: Sequence[int], first: Fraction, last: Fraction, budget: Budget
 ) -> tuple[dict[int, float | None], Fraction | None]:
     """What jumps and sides of bends are between two times, None where unknown; and a time inside at which one jumps."""
+    budget.spend((len(timed) + 1) * _PER_LINE)
+    budget.take(sum(tape.nodes[index].op in JUMPS | _BENDS for index in timed) * _ENTRY)
     lines: dict[int, Ends | None] = {}
     values: dict[int, float | None] = {}
     jump = None
     for index in timed:
         node = tape.nodes[index]
-        line = lines[index] = _short(_line(node, lines, first, last))
+        line = lines[index] = _short(_line(node, lines, first, last), budget)
         if node.op in _BENDS:
             values[index] = _side(node, [lines[arg] for arg in node.args])
         elif node.op in JUMPS:
@@ -171,9 +175,10 @@ def _side(node: Node, given: Sequence[Ends | None]) -> float | None:
     return 1.0 if min(over) >= 0 else 0.0 if max(over) <= 0 else None
 
 
-def _short(line: Ends | None) -> Ends | None:
-    """None of fractions that grow beyond all use."""
+def _short(line: Ends | None, budget: Budget) -> Ends | None:
+    """None of fractions that grow beyond all use; their length counts as work."""
     sizes = [part.bit_length() for end in line or () for part in (end.numerator, end.denominator)]
+    budget.spend(sum(sizes) * _PER_BIT)
     return None if any(size > _LONGEST for size in sizes) else line
 
 
@@ -216,6 +221,9 @@ def _replaced(
     rows = list(dict.fromkeys(course for course in values.values() if count == 1 or course.changes))
     if not rows:
         raise Unproved(f"time alone decides no jump of the dynamics at the ends of {count} pieces")
+    kept = sum(map(len, breaks)) + 3 * count + 1  # numbers of a course
+    model.budget.spend(len(rows) * len(values) * (100 + 10 * kept))
+    model.budget.take(len(rows) * kept * _ENTRY // 2)
     nodes: list[Node] = []
     place: list[int] = []
 

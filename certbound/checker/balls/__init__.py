@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certbound.checker.balls.eigen import cholesky, largest_eigenvalue
+from certbound.checker.balls.eigen import FEWEST_HALVINGS, cholesky, largest_eigenvalue
 from certbound.checker.balls.matrices import (
     column,
     diagonal,
@@ -17,6 +17,7 @@ from certbound.checker.balls.matrices import (
 from certbound.checker.balls.normal import below_and_above, tail
 
 __all__ = [
+    "FEWEST_HALVINGS",
     "below_and_above",
     "cholesky",
     "column",

@@ -8,6 +8,8 @@ from certbound.checker.balls.matrices import identity, is_positive_definite, mat
 from certbound.checker.report import Budget, Unproved
 
 _HALVINGS = 60
+FEWEST_HALVINGS = 40
+"""Matrices that are looked at for the `largest_eigenvalue` of one that is not 0 and has more than one row, at least."""
 
 
 def cholesky(a: arb_mat, budget: Budget | None = None) -> arb_mat:
@@ -16,10 +18,10 @@ def cholesky(a: arb_mat, budget: Budget | None = None) -> arb_mat:
     `Unproved` where that is not shown to be positive definite.
     """
     n = a.nrows()
+    if budget is not None:
+        budget.balls(n * n * (n + 9) // 3)
     low = [[arb(0)] * n for _ in range(n)]
     for j in range(n):
-        if budget is not None:
-            budget.check()
         pivot = a[j, j] - sum((x * x for x in low[j][:j]), arb(0))
         if not pivot > 0:
             raise Unproved("a matrix is not positive definite")
@@ -45,7 +47,7 @@ def largest_eigenvalue(a: arb_mat, budget: Budget | None = None) -> arb:
     low, high = arb(0), top
     one = identity(n)
     for _ in range(_HALVINGS):
-        if high - low <= high * arb(2) ** -40:
+        if high - low <= high * arb(2) ** -FEWEST_HALVINGS:
             break
         middle = ((low + high) / 2).mid()
         if is_positive_definite(one * middle - a, budget):

@@ -69,10 +69,10 @@ def is_positive_definite(a: arb_mat, budget: Budget | None = None) -> bool:
     (True, False)
     """
     n = a.nrows()
+    if budget is not None:
+        budget.balls(n * n * (n + 9) // 3)
     rows = [[a[i, j] for j in range(i + 1)] for i in range(n)]
     for j in range(n):
-        if budget is not None:
-            budget.check()
         pivot = rows[j][j]
         if not pivot > 0:
             return False

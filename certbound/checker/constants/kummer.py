@@ -19,12 +19,16 @@ from functools import reduce
 from flint import arb
 
 from certbound.checker.balls import upper
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, FUNCTION, Budget, Unproved, unlimited
 
 MOST_POWER = 1e5
 _LARGEST = arb(10) ** 7
 _CLOSE, _MOST_PARTS = 0.998, 1024
 _TERMS = 3000
+_BLOCK = 50
+"""Terms between two looks at the budget."""
+_SERIES, _PER_POWER, _MOST_PAID = 100_000, 800, 2_000
+"""Units of work of a hypergeometric function, and of each unit of its power up to a limit: 20 to 1,700 us measured."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,7 +55,7 @@ def exit_probability(data: Kummer, budget: Budget) -> arb:
     v: list[arb] = [data.v0]
     steps: list[arb] = []
     for slope, sigma, length in zip(data.slopes, data.sigmas, data.lengths):
-        budget.check()
+        budget.balls(120, BALL)
         after, step = _advance(data, v[-1], slope, sigma, length)
         v.append(after)
         steps.append(step)
@@ -71,7 +75,7 @@ def exit_probability(data: Kummer, budget: Budget) -> arb:
 def _least_discrete(data: Kummer, v: list[arb], info: list[arb], budget: Budget) -> arb | None:
     """Lower bound of the least gain over the steps; None where nothing is asked."""
     least: arb | None = None
-    excess = lower_excess(data)
+    excess = lower_excess(data, budget)
     for k, radius in enumerate(data.radii):
         budget.check()
         if radius is None:
@@ -83,7 +87,7 @@ def _least_discrete(data: Kummer, v: list[arb], info: list[arb], budget: Budget)
 
 def _least_continuous(data: Kummer, v: list[arb], info: list[arb], budget: Budget) -> arb | None:
     """The same over the pieces: I falls and v is monotone on a piece, and pieces are cut where that loses much."""
-    excess = lower_excess(data)
+    excess = lower_excess(data, budget)
     bounds: dict[int, arb] = {}
     attained: arb | None = None
     for k, radius in enumerate(data.radii):
@@ -138,24 +142,28 @@ def _phi(data: Kummer, info: arb) -> arb:
     return info if data.a.is_zero() else (data.a * info).expm1() / data.a
 
 
-def lower_excess(data: Kummer) -> Callable[[arb], arb]:
+def lower_excess(data: Kummer, budget: Budget | None = None) -> Callable[[arb], arb]:
     """Lower bound of E_a, which grows with z: large z are cut, and a partial sum of positive terms serves."""
+    limits = unlimited() if budget is None else budget
+    work = _SERIES + int(_PER_POWER * min(float(data.a), _MOST_PAID))
 
     def value(z: arb) -> arb:
+        limits.balls(1, work)
         z = arb.min(z.lower(), _LARGEST)
         a, b = data.a, data.half
         if not a.is_zero():
             exact = (a * z).hypgeom_0f1(b) if data.bessel else z.hypgeom_1f1(a, b)
             if exact.is_finite() and exact.rel_accuracy_bits() > 20:
                 return ((exact - 1) / a).lower()
-        return partial_excess(data, z)
+        return partial_excess(data, z, limits)
 
     return value
 
 
-def partial_excess(data: Kummer, z: arb) -> arb:
+def partial_excess(data: Kummer, z: arb, budget: Budget | None = None) -> arb:
     """Some of the terms of the series of E_a, which are all positive: the first ones, and those about the largest."""
-    first = _terms(data, z, 1, z / data.half)
+    limits = unlimited() if budget is None else budget
+    first = _terms(data, z, 1, z / data.half, limits)
     if not z > 0:
         return first
     a, b = float(data.a), float(data.half)
@@ -169,14 +177,16 @@ def partial_excess(data: Kummer, z: arb) -> arb:
         log += (k - 1) * data.a.log()
     else:
         log += (data.a + k).lgamma() - (data.a + 1).lgamma()
-    return arb.max(first, _terms(data, z, k, log.exp()))
+    return arb.max(first, _terms(data, z, k, log.exp(), limits))
 
 
-def _terms(data: Kummer, z: arb, start: int, first: arb) -> arb:
+def _terms(data: Kummer, z: arb, start: int, first: arb, budget: Budget) -> arb:
     """Lower bound of the sum of terms from number ``start`` on, the first of which is given."""
     a, b, little = data.a, data.half, arb(2) ** -60
     total = term = first
     for k in range(start, start + _TERMS):
+        if (k - start) % _BLOCK == 0:
+            budget.balls(_BLOCK, 6 * BALL)
         term = term * z / ((b + k) * (k + 1))
         term = term * a if data.bessel else term * (a + k)
         total += term
@@ -200,7 +210,7 @@ def _least_on(
     v, rest = ends[0], info[0]
     best: arb | None = None
     for _ in range(parts):
-        budget.check()
+        budget.balls(1, 120 * BALL + 4 * FUNCTION)
         after, step = _advance(data, v, slope, sigma, length)
         rest = rest - step
         value = _gain(data, excess, arb.max(rest, info[1]), square / arb.max(v, after))

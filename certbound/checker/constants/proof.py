@@ -14,12 +14,12 @@ from itertools import pairwise
 
 from flint import arb, arb_mat
 
-from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix
+from certbound.checker.balls import FEWEST_HALVINGS, cholesky, identity, is_positive_definite, matrix
 from certbound.checker.constants.kummer import MOST_POWER, Kummer, exit_probability
 from certbound.checker.constants.rates import Contraction, Spread
 from certbound.checker.constants.reach_tube import CurvePiece, Norm, Tube
 from certbound.checker.reading import Record, entries, number
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, round_demands, structure_of
 from certbound.errors import CertificateError
 
@@ -57,6 +57,7 @@ class _Proof:
         n = model.dimension
         if n > MOST_STATES:
             raise Unproved(f"{n} states are too many for this proof")
+        budget.hold(8 * n * n)
         metric = identity(n) if record["metric"] is None else matrix(record.symmetric("metric", n))
         self.norm = Norm(metric, budget)
         self._read_times()
@@ -118,6 +119,9 @@ class _Proof:
         nominal = cell.array("nominal", count, None, n)
         if any(not 1 <= len(item) <= MOST_DEGREE + 1 for item in nominal):
             raise CertificateError(f"`{cell.at('nominal')}` must hold polynomials of degree at most {MOST_DEGREE}.")
+        points = sum(map(len, nominal))
+        budget.hold(points * (n + 1) + 4 * count)
+        budget.balls(points * n)
         pieces = [
             CurvePiece(
                 start=start, end=end, middle=middle, coefficients=[[arb(x) for x in row] for row in item],
@@ -134,13 +138,15 @@ class _Proof:
         tube.prove(start, self.rate, eta, radii)
         hulls = []
         for piece in pieces:
-            budget.check()
+            budget.balls(piece.work)
             budget.hold(len(piece.coefficients) * n)
             hulls.append(piece.hull())
-        grid = Grid(
-            times=self.ends, hulls=hulls,
-            part=lambda k, first, last: replace(pieces[k], start=first, end=last).hull(),
-        )  # fmt: skip
+
+        def part(k: int, first: arb, last: arb) -> list[list[arb]]:
+            budget.balls(pieces[k].work)
+            return replace(pieces[k], start=first, end=last).hull()
+
+        grid = Grid(times=self.ends, hulls=hulls, part=part)
         self._check_rooms(cell, grid, radii)
 
     def _check_rooms(self, cell: Record, grid: Grid, radii: Sequence[arb]) -> None:
@@ -156,11 +162,14 @@ class _Proof:
                 if id(row) not in duals:
                     duals[id(row)] = self.norm.dual(row)
             asked.append((demand.label, demand.rooms, [duals[id(row)] for row in demand.rows]))
-        for ball in round_demands(self.model, grid, self.budget):
+        rounds = round_demands(self.model, grid, self.budget)
+        sizes = [ball.image.nrows() for ball in rounds]
+        self.budget.expect(sum(k * k * k // 3 for k in sizes if k > 1) * FEWEST_HALVINGS * BALL)
+        for ball in rounds:
             asked.append((ball.label, ball.rooms, [self.norm.section(ball.image)] * self.count))
         random = self.model.initial.covariance is not None
         for label, rooms, lengths in asked:
-            self.budget.check()
+            self.budget.balls(4 * self.count)
             for k, (left, length) in enumerate(zip(rooms, lengths)):
                 if left is None:
                     continue
@@ -219,6 +228,7 @@ class _Proof:
             for low, high in ends
         ]
         rows = [*(model.plan or []), *(row for change in model.changes or [] for row in (change.low, change.high))]
+        self.budget.spend(sum(map(len, rows)) * 100)
         columns = list(zip(*rows))
         inputs = [(arb(min(column)), arb(max(column))) for column in columns]
         disturbances = [(arb(a), arb(b)) for a, b in model.disturbance]
@@ -258,6 +268,7 @@ class _Proof:
         """The random start's covariance is at most sigma^2 P^-1."""
         n = self.model.dimension
         root = cholesky(self.norm.metric, self.budget)
+        self.budget.products(2, n, n, n)
         rest = identity(n) * (sigma * sigma) - root.transpose() * covariance * root
         if not is_positive_definite(rest, self.budget):
             raise Unproved("the random start was not shown to have the stated spread")

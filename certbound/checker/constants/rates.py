@@ -14,7 +14,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import cholesky, identity, is_positive_definite, matrix
 from certbound.checker.expressions import Graph, Program, Undecided, is_partial
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, Budget, Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.problem.model import JUMPS, Tape
 
@@ -38,7 +38,8 @@ class Contraction:
             self.fixed[i][j] = constant
             for atom, factor in parts.items():
                 if atom not in forms:
-                    budget.hold(n * n)
+                    budget.hold(2 * n * n)
+                    budget.products(n, n)
                     forms[atom] = [[arb(0)] * n for _ in range(n)]
                 forms[atom][i][j] = factor
         self.atoms = sorted(forms)
@@ -71,6 +72,8 @@ class Contraction:
             ranges = self.program.run([low.union(high) if low < high else low for low, high in box])
         except Undecided:
             return False
+        n = self.model.dimension
+        self.budget.products(2 * len(self.forms) + 2, n, n)
         base, wide = matrix(self.fixed), []
         for value, form in zip(ranges, self.forms):
             if value.is_exact():
@@ -79,8 +82,9 @@ class Contraction:
                 wide.append((form * value.lower(), form * value.upper()))
             if 2 ** len(wide) > MOST_VERTICES:
                 raise Unproved(f"the Jacobian has {len(wide)} independent parts or more, too many to try every vertex")
+        self.budget.expect((n * n * n // 3 * BALL) << len(wide))
         for choice in itertools.product((0, 1), repeat=len(wide)):
-            self.budget.check()
+            self.budget.products(n, n, 2 * n + len(wide) + 8)
             jacobian = base
             for place, pair in zip(choice, wide):
                 jacobian = jacobian + pair[place]
@@ -132,7 +136,7 @@ def _affine(graph: Graph, node: int) -> tuple[arb, dict[int, arb]]:
     stack = [(node, arb(1))]
     count = 0
     while stack:
-        graph.budget.check()
+        graph.budget.balls(2)
         index, factor = stack.pop()
         op, args, *_ = graph.node(index)
         count += 1
@@ -251,12 +255,14 @@ class Spread:
         return not self._holds(point, sigma if self.program is None else sigma * (1 + _SLACK), nu)
 
     def _holds(self, box: Box, sigma: arb, nu: arb) -> bool:
+        n = self.model.dimension
+        self.budget.products(3, n, n, n + 6)
         covariance = self._covariance(box)
         if covariance is None:
             return False
         if all(entry.is_zero() for entry in covariance.entries()):  # no noise exceeds nothing
             return True
-        n, square = self.model.dimension, sigma * sigma
+        square = sigma * sigma
         rest = identity(n) * square - self.root.transpose() * covariance * self.root
         bounded = is_positive_definite(rest, self.budget)
         return bool(bounded and (self.metric * covariance).trace() <= nu * square)
@@ -269,6 +275,7 @@ class Spread:
         except Undecided:
             return None
         n = self.model.dimension
+        self.budget.products(len(values), n + 12)
         g = arb_mat(n, len(values) // n, values)
         product = g * g.transpose()
         rows = [[product[i, j] for j in range(n)] for i in range(n)]

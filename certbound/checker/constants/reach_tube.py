@@ -19,7 +19,7 @@ from flint import arb, arb_mat
 from certbound.checker.balls import cholesky, column, largest_eigenvalue, magnitude
 from certbound.checker.constants.kummer import growth_integral
 from certbound.checker.expressions import Program, Undecided, expand
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import PRODUCT, Budget, Unproved
 from certbound.checker.statement import Change, Model, Structure
 
 ORDER = 6
@@ -34,12 +34,13 @@ class Norm:
     def __init__(self, metric: arb_mat, budget: Budget) -> None:
         self.metric, self.size, self.budget = metric, magnitude(metric), budget
         self.root = cholesky(metric, budget)
-        self.inverse = metric.inv()
         self.n = metric.nrows()
+        budget.products(self.n, self.n, self.n)
+        self.inverse = metric.inv()
 
     def length(self, vector: Sequence[arb]) -> arb:
         """Upper bound of the norm of a box: that of its middle plus that of its radii."""
-        self.budget.check()
+        self.budget.products(2, self.n, self.n + 12)
         middle = column([x.mid() for x in vector])
         radius = column([x.rad() for x in vector])
         squares = [(middle.transpose() * self.metric * middle)[0, 0], (radius.transpose() * self.size * radius)[0, 0]]
@@ -47,12 +48,13 @@ class Norm:
 
     def dual(self, row: Sequence[arb]) -> arb:
         """Upper bound of sqrt(a^T P^-1 a)."""
-        self.budget.check()
+        self.budget.products(self.n, self.n + 6)
         flat = arb_mat(1, self.n, list(row))
         return arb.max((flat * self.inverse * flat.transpose())[0, 0].upper(), arb(0)).sqrt().upper()
 
     def section(self, image: arb_mat) -> arb:
         """Upper bound of sup |W y| over |y|_P <= 1."""
+        self.budget.products(image.nrows(), self.n, self.n + image.nrows())
         return largest_eigenvalue(image * self.inverse * image.transpose(), self.budget).sqrt().upper()
 
     def start(self, model: Model, low: Sequence[arb], high: Sequence[arb], centre: Sequence[arb], whole: bool) -> arb:
@@ -72,6 +74,7 @@ class Norm:
                 reach = largest_eigenvalue(self.metric, self.budget).sqrt() * arb(initial.radius)
             else:
                 inner = cholesky(initial.shape, self.budget)
+                self.budget.products(2, self.n, self.n, self.n)
                 reach = largest_eigenvalue(inner.transpose() * self.metric * inner, self.budget).sqrt()
             shift = self.length([arb(x) - c for x, c in zip(initial.centre, centre)])
             bound = arb.min(bound, reach + shift)
@@ -94,6 +97,11 @@ class CurvePiece:
         for lower in self.coefficients[-2::-1]:
             value = [c + tau * v for c, v in zip(lower, value)]
         return value
+
+    @property
+    def work(self) -> int:
+        """Operations of balls of its `hull`, or of its `series`."""
+        return 3 * len(self.coefficients) ** 2 * (len(self.coefficients[0]) + 1)
 
     def hull(self) -> list[list[arb]]:
         """Bernstein points: the curve lies in their convex hull."""
@@ -149,6 +157,7 @@ class Tube:
         if not self.model.continuous:
             return [arb(x) for x in plan[min(k, len(plan) - 1)]]
         piece, count = self.pieces[k], len(plan)
+        self.budget.balls(10 * (1 + len(plan[0])))
         horizon, first, last = (Fraction(float(x)) for x in (arb(self.model.horizon), piece.start, piece.end))
         near = horizon / 2**47
         row = min(int((first + last) / 2 * count / horizon), count - 1)
@@ -174,7 +183,7 @@ class Tube:
 
     def defect(self, k: int) -> arb:
         """Upper bound of |p' - f(p, d, t)|_P over piece k and all d (discrete time: of |p_{k+1} - f(p_k, d, k)|_P)."""
-        self.budget.check()
+        self.budget.balls(3 * self.pieces[k].work)
         try:
             points, rest = self._at_centre(k)
             columns = [] if not self.reach else self._with_disturbance(k, rest)
@@ -183,6 +192,7 @@ class Tube:
         worst = arb(0)
         for point in points:
             for signs in itertools.product((-1, 1), repeat=len(columns)):
+                self.budget.balls(2 * len(columns) * len(point))
                 corner = list(point)
                 for sign, values in zip(signs, columns):
                     corner = [a + sign * b for a, b in zip(corner, values)]
@@ -214,6 +224,7 @@ class Tube:
     ) -> tuple[list[list[arb]], list[arb]]:
         """The same over ``span`` about ``centre``, from the middle of the piece."""
         model, piece = self.model, self.pieces[k]
+        self.budget.balls(4 * piece.work)
         parts = []
         for tau in (centre, centre + span):
             time = [piece.middle + tau, arb(1)]
@@ -244,9 +255,9 @@ class Tube:
 
     def ranges(self, k: int) -> list[tuple[arb, arb]]:
         """The box hull of the curve on a piece."""
+        self.budget.balls(2 * self.pieces[k].work)
         points = self.pieces[k].hull()
         result = []
-        self.budget.check()
         for x in range(self.model.dimension):
             low = high = points[0][x]
             for point in points[1:]:
@@ -256,8 +267,11 @@ class Tube:
 
     def prove(self, start: arb, slope: arb, eta: Sequence[arb], radii: Sequence[arb]) -> None:
         """Prove that the stated defects and radii hold."""
+        n, many = self.model.dimension, 1 << len(self.reach) if len(self.reach) <= CORNERS else 1
+        self.budget.expect(len(eta) * many * 2 * n * n * PRODUCT)
         rho = start
         for k, piece in enumerate(self.pieces):
+            self.budget.balls(80 + 4 * piece.work)
             if k < len(eta) and not self.defect(k) <= eta[k]:
                 raise Unproved(f"the defect of the nominal curve was not shown to be at most eta on piece {k}")
             after = rho

@@ -30,13 +30,16 @@ from flint import arb, fmpq, fmpq_poly
 
 from certbound.checker.expressions import Ceiling, Graph, Side
 from certbound.checker.reading import Record
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import FUNCTION, Budget, Unproved
 from certbound.checker.statement import Constraint, Model
 from certbound.errors import CertificateError
-from certbound.problem.model import Tape
+from certbound.problem.model import Node, Tape
 
 MOST_CELLS = 20_000
 _MOST_DEGREE, _MOST_BITS = 100, 20_000
+_TOO_LONG = "the model is a polynomial of too high a degree, or with too long coefficients"
+_RATIONAL, _PER_BYTE = 40_000, 80
+"""Units of work of an operation of rational polynomials, and of a byte of its result: up to 20 us, 3 to 80 ns."""
 _PROOF = ("engine", "mirrored", "edges", "slopes", "tail")
 
 
@@ -178,6 +181,7 @@ class _Proof:
         node = room if self.above else graph.neg(room)
         balance = Ceiling(graph, node, [flow, square], count=count + 1, budget=self.budget)
         noise = Ceiling(graph, graph.neg(square), [square], count=count + 1, budget=self.budget)
+        self.budget.expect(len(self.slopes) * balance.work)
         zero = (arb(0), arb(0))
         pushes = [(arb(low), arb(high)) for low, high in model.disturbance]
         tiny = -arb(2) ** -900
@@ -204,16 +208,20 @@ class _Proof:
             raise Unproved("the last piece serves no disturbances")
         given = self.model.noise.diffusion
         moved = fmpq_poly([0, self.sign])
-        drift = self.sign * _polynomial(self.model.dynamics, moved)[0]
+        drift = self.sign * _polynomial(self.model.dynamics, moved, self.budget)[0]
         if isinstance(given, Tape):
-            entries = _polynomial(given, moved)
+            entries = _polynomial(given, moved, self.budget)
         else:
             entries = [fmpq_poly([_exact(float(x))]) for x in given.entries()]
+        sizes = [_size(entry) for entry in (drift, *entries)]
+        self.budget.spend(sum(_RATIONAL + 6 * _PER_BYTE * _bytes(2 * degree, 2 * bits) for degree, bits in sizes))
         square = sum((entry * entry for entry in entries), fmpq_poly([0]))
         power = kind == "power"
         if not rate > (1.0 if power else 0.0) or (power and not self.edges[-1] > 0):
             raise Unproved("the last piece has no finite integral")
         left = 2 * drift * (fmpq_poly([0, 1]) if power else fmpq_poly([1])) - _exact(rate) * square
+        degree, bits = _size(left)
+        self.budget.spend(_RATIONAL + _PER_BYTE * _bytes(degree, bits + 1100 * (degree + 1)))
         about = left(fmpq_poly([_exact(self.edges[-1]), 1]))
         if not all(coefficient >= 0 for coefficient in about.coeffs()):
             raise Unproved("the last piece was not shown to be on its side of the drift")
@@ -222,6 +230,7 @@ class _Proof:
 
     def share(self) -> arb:
         """w at the start that is nearest to the failing end."""
+        self.budget.balls(len(self.slopes), 12 * FUNCTION)
         psi, whole, rest, start = arb(0), arb(0), arb(0), self.start
         last = arb(self.edges[-1])
         if not start <= last:
@@ -258,7 +267,9 @@ def check_drift(model: Model, value: object, budget: Budget) -> arb:
             if not (face.slope <= 0 and face.excess(arb(sign * limit)) <= 0):
                 raise Unproved(f"\"{constraint.label}\" was not shown to be kept on the whole half-line")
     size = model.noise.covariance()[0, 0].upper()
-    ahead = sign * _polynomial(model.dynamics, fmpq_poly([0, sign]))[0] - fmpq_poly([0, 1])
+    ahead = sign * _polynomial(model.dynamics, fmpq_poly([0, sign]), budget)[0] - fmpq_poly([0, 1])
+    degree, bits = _size(ahead)
+    budget.spend(_RATIONAL + _PER_BYTE * _bytes(degree, bits + 1100 * (degree + 1)))
     about = ahead(fmpq_poly([sign * _exact(limit), 1]))
     first = arb(about[0].p) / arb(about[0].q)
     if not (first >= arb(rate) * size / 2 and all(coefficient >= 0 for coefficient in about.coeffs()[1:])):
@@ -279,11 +290,14 @@ def _exact(value: float) -> fmpq:
     return fmpq(*value.as_integer_ratio())
 
 
-def _polynomial(tape: Tape, state: fmpq_poly) -> list[fmpq_poly]:
+def _polynomial(tape: Tape, state: fmpq_poly, budget: Budget) -> list[fmpq_poly]:
     """A tape's outputs as polynomials, exactly; Unproved where they are none."""
     values: list[Any] = []
-    for node in tape.nodes:
+    sizes: list[tuple[int, int]] = []
+    ended, _ = tape.lives()
+    for node, over in zip(tape.nodes, ended):
         args = [] if node.op == "input" else [values[arg] for arg in node.args]
+        _count(node, [] if node.op == "input" else [sizes[arg] for arg in node.args], budget)
         if node.op == "input":
             values.append(state)
         elif node.op == "const":
@@ -296,11 +310,35 @@ def _polynomial(tape: Tape, state: fmpq_poly) -> list[fmpq_poly]:
             values.append(_RING[node.op](*args))
         else:
             raise Unproved(f"the last piece needs a polynomial model, and {node.op} is none")
-        last = values[-1]
-        bits = max((part.bit_length() for part in (last.denom(), *map(int, last.numer().coeffs()))), default=0)
-        if last.degree() > _MOST_DEGREE or bits > _MOST_BITS:
-            raise Unproved("the model is a polynomial of too high a degree, or with too long coefficients")
+        sizes.append(_size(values[-1]))
+        if sizes[-1][0] > _MOST_DEGREE or sizes[-1][1] > _MOST_BITS:
+            raise Unproved(_TOO_LONG)
+        budget.take(_bytes(*sizes[-1]))
+        for place in over:
+            values[place] = None
+            budget.give(_bytes(*sizes[place]))
     return [values[output] for output in tape.outputs]
+
+
+def _size(value: fmpq_poly) -> tuple[int, int]:
+    """Degree, and bits of the longest coefficient, of numerators over their common denominator."""
+    return value.degree(), max((int(part).bit_length() for part in (value.denom(), *value.numer().coeffs())), default=0)
+
+
+def _bytes(degree: int, bits: int) -> int:
+    return 200 + (degree + 2) * (bits // 8 + 8)
+
+
+def _count(node: Node, given: Sequence[tuple[int, int]], budget: Budget) -> None:
+    """Count an operation by the longest polynomial that it may give."""
+    degrees, bits = [max(degree, 0) for degree, _ in given] or [1], [own for _, own in given] or [1100]
+    times = 2 if node.op == "sq" else int(min(max(node.value, 1.0), 20.0)) if node.op == "pow" else 1
+    degree = sum(degrees) if node.op == "mul" else times * max(degrees)
+    if degree > _MOST_DEGREE:
+        raise Unproved(_TOO_LONG)
+    size = _bytes(degree, times * sum(bits) + 2 * degree)
+    budget.fits(3 * size)
+    budget.spend(_RATIONAL + _PER_BYTE * size)
 
 
 _RING: dict[str, Any] = {

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from flint import arb
 
 _WIDE = 1e-9
+_FARTHEST = arb(2) ** 1100
+"""Beyond all floats: a wave is evaluated nearer only, as it takes all bits of its argument."""
 
 
 class Undecided(Exception):
@@ -43,7 +45,17 @@ def square(x: arb) -> arb:
 
 def wave(function: Callable[[arb], arb]) -> Callable[[arb], arb]:
     """A function with values in [-1, 1], also on unbounded balls (but not of what is undefined)."""
-    return lambda x: function(x) if x.is_finite() else x if x.is_nan() else arb(0, 1)
+    return lambda x: function(x) if abs(x) < _FARTHEST else x if x.is_nan() else arb(0, 1)
+
+
+def sin_cos(x: arb) -> tuple[arb, arb]:
+    """Sine and cosine."""
+    return x.sin_cos() if abs(x) < _FARTHEST else (sin(x), cos(x))
+
+
+def tan(x: arb) -> arb:
+    """Tangent, of no number where the argument is beyond all floats."""
+    return x.tan() if abs(x) < _FARTHEST else arb.nan()
 
 
 sqrt, exp, log = increasing(arb.sqrt), increasing(arb.exp), increasing(arb.log)

@@ -55,6 +55,7 @@ class Ceiling:
         for a in range(len(gradient)):
             for b in range(a, len(gradient)):
                 budget.check()
+                budget.hold(2)
                 second[a, b] = graph.derivative(gradient[a], self.slots[b])
         self._pairs = [pair for pair, index in second.items() if not graph.is_const(index, 0.0)]
         hessian = [second[pair] for pair in self._pairs]
@@ -66,6 +67,11 @@ class Ceiling:
         self._kinked = any(graph.node(index).op in ("kink", "bent") for index in graph.reachable(gradient))
         for program in (self._thin, self._wide, self._slopes, self._range):
             program.prepare([])
+
+    @property
+    def work(self) -> int:
+        """Units of work of one look at a box, at least."""
+        return self._thin.work
 
     def prove(
         self, box: Sequence[Side], bound: arb, skip: Callable[[Sequence[arb], Sequence[arb]], bool] = lambda *_: False,
@@ -84,7 +90,7 @@ class Ceiling:
             if not stack:
                 return True
             self.budget.box()
-            self.budget.check()
+            self.budget.balls(12 * len(first) + 6 * len(self._pairs))
             current, depth = stack.pop()
             centre = [middle_of(side) for side in current]
             radius = [arb.max(high - c, c - low).upper() for (low, high), c in zip(current, centre)]

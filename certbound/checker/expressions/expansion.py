@@ -10,8 +10,10 @@ from certbound.checker.expressions import networks
 from certbound.checker.expressions.arithmetic import Undecided, holds
 from certbound.checker.expressions.graph import Graph
 from certbound.checker.expressions.operations import OPERATIONS
+from certbound.checker.expressions.program import work_of
 from certbound.checker.expressions.quadratic import Quadratic
 from certbound.checker.expressions.taylor import Model, constant
+from certbound.checker.report import BALL, STEP, Budget
 from certbound.problem.model import Part
 
 _ZERO = arb(0)
@@ -31,8 +33,9 @@ class Expansion:
     def __init__(self, graph: Graph, node: int, guard: int, *, variables: int) -> None:
         self.variables, self._budget = variables, graph.budget
         order = graph.reachable([node, guard])
-        self._budget.check()
-        self._budget.hold(4 * len(order))
+        self._budget.spend(5 * STEP * len(order))
+        self._budget.hold(sum(4 + graph.bits[index] // 512 for index in order))
+        self._bits = [graph.bits[index] for index in order]
         place = {index: number for number, index in enumerate(order)}
         below = (1 << variables) - 1
         self._nodes: list[_Step] = []
@@ -43,21 +46,26 @@ class Expansion:
         self._early = [number for number, index in enumerate(order) if not graph.masks[index] & below]
         self._first = [number for number, index in enumerate(order) if graph.masks[index] & below == 1]
         self._later = [number for number, index in enumerate(order) if graph.masks[index] & below > 1]
+        early = set(self._early)
+        self.work = sum(  # of its parameters and of one box, at least
+            STEP + (1 if number in early else 2) * work_of(op, 0) for number, (op, *_) in enumerate(self._nodes)
+            if op not in ("input", "const")
+        )
         self._output, self._guard = place[node], place[guard]
         self._template: list[Model | None] = []
         self._last: tuple[arb, dict[int, arb]] | None = None
 
     def prepare(self, parameters: Sequence[arb]) -> None:
         """Set the parameters (inputs ``variables``, ``variables + 1``, ...)."""
-        self._budget.check()
         values: list[Model | None] = [None] * len(self._nodes)
         for number in self._early:
             op, args, value = self._nodes[number]
+            self._budget.balls(1, STEP + work_of(op, self._bits[number]))
             try:
                 if op == "input":
                     values[number] = constant(parameters[args[0] - self.variables])
                 else:
-                    values[number] = _value(op, args, value, values)
+                    values[number] = _value(op, args, value, values, self._budget)
             except Undecided:
                 values[number] = None
         self._template, self._last = values, None
@@ -83,6 +91,7 @@ class Expansion:
             raise Undecided
         if not found.range().is_finite():
             raise Undecided
+        self._budget.balls(size * size // 4 + len(found.squares))
         gradient, hessian = [_ZERO] * size, [[_ZERO] * size for _ in range(size)]
         for a, c in found.linear.items():
             gradient[a] = c
@@ -103,17 +112,28 @@ class Expansion:
                 centre, linear = inputs[args[0]]
                 values[number] = Model(centre, linear, {}, _ZERO, {})
             else:
-                found = values[number] = _value(op, args, value, values)
+                self._count(op, args, values)
+                found = values[number] = _value(op, args, value, values, self._budget)
                 if found is not None and len(found.squares) > _MANY:
-                    self._budget.check()
                     self._budget.hold(3 * len(found.squares))
 
+    def _count(self, op: str, args: tuple[int, ...], values: list[Model | None]) -> None:
+        """Count the work of an operation by the terms of what it takes."""
+        linear = squares = 0
+        for arg in args:
+            model = values[arg]
+            if model is not None:
+                linear, squares = max(linear, len(model.linear)), max(squares, len(model.squares))
+        self._budget.balls(1, STEP + 2 * work_of(op, 0) + BALL * (linear * (linear + 8) + 4 * squares))
 
-def _value(op: str, args: tuple[int, ...], value: float | Part, values: list[Model | None]) -> Model | None:
+
+def _value(
+    op: str, args: tuple[int, ...], value: float | Part, values: list[Model | None], budget: Budget
+) -> Model | None:
     """A node's model; None is what is not defined. A jump, a kink or a branch cut in the box is `Undecided`."""
     if isinstance(value, Part):
         inner = [model for model in (values[arg] for arg in args) if model is not None]
-        return networks.model(value, inner) if len(inner) == len(args) else None
+        return networks.model(value, inner, budget) if len(inner) == len(args) else None
     if op == "const":
         return constant(arb(value))
     given = [model for model in (values[arg] for arg in args) if model is not None]

@@ -7,23 +7,31 @@ the tape has it, lest a simplification hide where it is undefined.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 
 from certbound.checker.expressions import networks
 from certbound.checker.expressions.operations import OPERATIONS
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import STEP, Budget, Unproved, unlimited
 from certbound.problem.model import Node, Part, Tape
 
 MOST_NODES = 400_000
 _NODE = 6
 """Memory of a node, in balls."""
+_MANY = 1000
+"""Edges between two looks at the budget."""
+_NODE_WORK, _EDGE = 5 * STEP, 600
+"""Units of work of a node that is made, 3 to 6 us, and of an edge on the way through a graph."""
+_PRODUCTS = frozenset(["mul", "sq", "div", "hypot", "atan2"])
+_SUMS = frozenset(["add", "sub", "neg", "abs", "min", "max", "kink", "if_else_zero", "sqrt"])
+_BITS, _FLOAT, _POWER = 512, 12, 14
+"""Bits of the exponent of a function's value, at most, of a float, and of those that a power adds."""
 
 
 class Graph:
     """A growing set of expressions over numbered inputs; ``budget`` limits what is built and what runs over it.
 
     ``nodes`` are operations, arguments before their users; bit i of ``masks`` is set where a node depends on input i.
+    ``bits`` bound the length of the exponents of a node's values: products of products have long ones.
 
     Examples
     --------
@@ -36,9 +44,10 @@ class Graph:
     """
 
     def __init__(self, budget: Budget | None = None) -> None:
-        self.budget = Budget(math.inf) if budget is None else budget
+        self.budget = unlimited() if budget is None else budget
         self.nodes: list[Node] = []
         self.masks: list[int] = []
+        self.bits: list[int] = []
         self._numbers: dict[tuple[str, tuple[int, ...], str | Part], int] = {}
         self._derivatives: dict[tuple[int, int], int] = {}
 
@@ -53,12 +62,15 @@ class Graph:
         if len(self.nodes) >= MOST_NODES:
             raise Unproved(f"the model and its derivatives have more than {MOST_NODES} operations")
         self.nodes.append(Node(op, args, value, part))
-        mask = 1 << args[0] if op == "input" else 0
+        mask, bits = 1 << args[0] if op == "input" else 0, 0
         if op != "input":
             for arg in args:
                 mask |= self.masks[arg]
+                bits = max(bits, self.bits[arg])
+        self.budget.spend(_NODE_WORK + mask.bit_length() // 8 + _EDGE * len(args))
         self.budget.hold(_NODE + mask.bit_length() // 512)
         self.masks.append(mask)
+        self.bits.append(longer(op, bits))
         self._numbers[key] = len(self.nodes) - 1
         return len(self.nodes) - 1
 
@@ -138,13 +150,17 @@ class Graph:
     def reachable(self, outputs: Iterable[int]) -> list[int]:
         """All nodes that some nodes depend on, in topological order."""
         seen: set[int] = set()
-        stack = list(outputs)
+        stack, paid = list(outputs), 0
         while stack:
             index = stack.pop()
             if index in seen:
                 continue
             seen.add(index)
             node = self.nodes[index]
+            paid -= 1 + len(node.args)
+            if paid < 0:
+                self.budget.spend(_EDGE * (_MANY - paid))
+                paid = _MANY
             if node.op != "input":
                 stack.extend(node.args)
         return sorted(seen)
@@ -157,11 +173,19 @@ class Graph:
         if not self.masks[index] & bit:
             return self.const(0.0)
         known = self._derivatives
-        for place in self.reachable([index]):
-            if self.masks[place] & bit and (place, slot) not in known:
-                self.budget.check()
-                self.budget.hold(2)
-                known[place, slot] = self._rule(place, slot)
+        stack = [index]
+        while stack:  # what is known already is not looked at again
+            place = stack[-1]
+            node = self.nodes[place]
+            due = [arg for arg in node.args if self.masks[arg] & bit and (arg, slot) not in known] if (
+                node.op != "input" and (place, slot) not in known) else []
+            self.budget.spend(3 * STEP + _EDGE * len(node.args))
+            stack.extend(due)
+            if not due:
+                stack.pop()
+                if (place, slot) not in known:
+                    self.budget.hold(2)
+                    known[place, slot] = self._rule(place, slot)
         return known[index, slot]
 
     def _known(self, index: int, slot: int) -> int:
@@ -178,3 +202,12 @@ class Graph:
             return self.const(0.0)
         slopes = [self._known(arg, slot) for arg in args]
         return slope(self, index, *args, *slopes, *([value] if op == "pow" else []))
+
+
+def longer(op: str, bits: int) -> int:
+    """Bits of the exponent of an operation's value from those of its arguments."""
+    if op in _PRODUCTS:
+        return bits + 1
+    if op == "pow":
+        return bits + _POWER
+    return _FLOAT if op in ("const", "input") else bits if op in _SUMS else _BITS

@@ -12,7 +12,7 @@ from certbound.checker.expressions import series as ts
 from certbound.checker.expressions import taylor as tm
 from certbound.checker.expressions.activation_balls import ACTIVATIONS, Activation, Constants, kinked, line
 from certbound.checker.expressions.arithmetic import Undecided, square
-from certbound.checker.report import Unproved
+from certbound.checker.report import BALL, FUNCTION, PRODUCT, Budget, Unproved
 from certbound.problem.model import Layer, Network, Part
 
 _ZERO = arb(0)
@@ -72,15 +72,29 @@ def slope(graph: Builder, part: Part, args: tuple[int, ...], slopes: Sequence[in
     return total
 
 
+def _count(network: Network, columns: int, budget: Budget, *, behind: bool = False) -> None:
+    """Count the work of all layers for so many columns; ``behind``: and of errors on their way through the layers."""
+    total, way = 0, 0
+    for layer in network.layers:
+        rows, taken = len(layer.bias), len(layer.weights[0])
+        way += rows * taken
+        total += rows * (taken * columns * PRODUCT + columns * 3 * BALL + 4 * FUNCTION)
+        total += rows * way * (PRODUCT + BALL) if behind and not network.smooth else 0
+    rows = len(network.layers[-1].bias)
+    budget.balls(1, total + (rows * way * (PRODUCT + BALL) if behind else 0))
+
+
 # ---- balls -----------------------------------------------------------------------------------------------------
 
 
-def ball(part: Part, args: Sequence[arb]) -> arb:
+def ball(part: Part, args: Sequence[arb], budget: Budget) -> arb:
     """The range of a part; a second derivative that may jump is `Undecided`."""
     if not all(x.is_finite() for x in args):
         return arb.nan()
     order = len(part.by)
-    values, slopes, bends, edge = _LAST.of((part.network, order), args, lambda: _ranges(part.network, args, order))
+    values, slopes, bends, edge = _LAST.of(
+        (part.network, order), args, lambda: _ranges(part.network, args, order, budget)
+    )
     if order == 0:
         result: arb = values[part.output]
         return result
@@ -92,10 +106,13 @@ def ball(part: Part, args: Sequence[arb]) -> arb:
 
 
 def _ranges(
-    network: Network, args: Sequence[arb], order: int
+    network: Network, args: Sequence[arb], order: int, budget: Budget
 ) -> tuple[list[arb], Any, dict[tuple[int, ...], Any], bool]:
     """Values, first derivatives, second derivatives by pairs, and whether a kink may lie in the box."""
     n = len(args)
+    columns = 1 + n + (n * (n + 1) // 2 if order > 1 else 0)
+    budget.fits(64 * 5 * (n * n + columns * max(len(layer.bias) for layer in network.layers)))  # with the last answers
+    _count(network, columns, budget)
     centre, radius = [arb(x.mid()) for x in args], [arb(x.rad()) for x in args]
     values, slopes = list(args), arb_mat(n, n, [arb(int(i == j)) for i in range(n) for j in range(n)])
     pairs = [(i, j) for i in range(n) for j in range(i, n)] if order > 1 else []
@@ -134,10 +151,11 @@ def _affine(weights: arb_mat, bias: Sequence[arb], x: Sequence[arb]) -> list[arb
     return [a + b for a, b in zip((weights * arb_mat([[value] for value in x])).entries(), bias)]
 
 
-def series(part: Part, args: Sequence[ts.Series]) -> ts.Series:
+def series(part: Part, args: Sequence[ts.Series], budget: Budget) -> ts.Series:
     """Taylor coefficients of an output."""
     if part.by:
         raise Undecided
+    _count(part.network, len(args[0]) ** 2, budget)
     rows: list[ts.Series] = [list(x) for x in args]
     for weights, _, bias, row, constants in _matrices(part.network):
         moved = (weights * arb_mat(rows)).tolist()
@@ -148,25 +166,29 @@ def series(part: Part, args: Sequence[ts.Series]) -> ts.Series:
 # ---- Taylor models -----------------------------------------------------------------------------------------------
 
 
-def model(part: Part, args: Sequence[tm.Model]) -> tm.Model | None:
+def model(part: Part, args: Sequence[tm.Model], budget: Budget) -> tm.Model | None:
     """The model of an output over a box; None where it is not defined."""
     if part.by:
-        whole = ball(part, [x.range() for x in args])
+        whole = ball(part, [x.range() for x in args], budget)
         return tm.Model(arb(whole.mid()), {}, {}, arb(whole.rad()), {}) if whole.is_finite() else None
     if not all(x.range().is_finite() for x in args):
         return None
     key = part.network, tuple(map(_digits, args))
     found = _MODELS.get(key)
     if found is None:
-        if len(_MODELS) >= _MOST_MODELS:
+        columns = _Columns(part.network, args, budget)
+        found = columns.through_all()
+        if (len(_MODELS) + 1) * len(found) * columns.count > _MOST_KEPT:
             _MODELS.clear()
-        found = _MODELS[key] = _models(part.network, args)
+        if len(found) * columns.count <= _MOST_KEPT:
+            _MODELS[key] = found
     return found[part.output]
 
 
 _MODELS: dict[Any, list[tm.Model]] = {}
 """Models by the very digits of their arguments: outputs of the dynamics that call one network ask the same."""
-_MOST_MODELS = 4000
+_MOST_KEPT = 500_000
+"""Balls of these models."""
 
 
 def _digits(x: tm.Model) -> tuple[Any, ...]:
@@ -185,8 +207,8 @@ class _Columns:
     order, only the outputs, and the layers between take the sum of all sizes.
     """
 
-    def __init__(self, network: Network, args: Sequence[tm.Model]) -> None:
-        self.smooth = network.smooth
+    def __init__(self, network: Network, args: Sequence[tm.Model], budget: Budget) -> None:
+        self.network, self.smooth = network, network.smooth
         found = sorted({a for x in args for a in x.linear} | {a for x in args for pair in x.squares for a in pair})
         self.linear = found
         held = {pair for x in args for pair in x.squares}
@@ -198,6 +220,9 @@ class _Columns:
         self.cubes = [
             (a, b, c) for i, a in enumerate(found) for k, b in enumerate(found[i:], i) for c in found[k:]
         ] if self.smooth and len(found) <= _MOST_CUBIC else []
+        self.count = 1 + len(found) + len(self.squares) + len(self.cubes)
+        budget.fits(64 * 3 * self.count * max(len(args), *(len(layer.bias) for layer in network.layers)))
+        _count(network, 2 * self.count, budget, behind=True)
         place = {a: 1 + k for k, a in enumerate(found)}
         self.second, self.third = 1 + len(found), 1 + len(found) + len(self.squares)
         self.bends = [(place[a], place[b], 1 if a == b else 2) for a, b in self.squares]
@@ -302,6 +327,16 @@ class _Columns:
             found[number] += half * x
         return found
 
+    def through_all(self) -> list[tm.Model]:
+        """All outputs of the network."""
+        shares = [0.0] * len(self.linear)
+        for number, (weights, size, bias, row, constants) in enumerate(_matrices(self.network)):
+            self.through(weights, size, bias)
+            if number == 0:
+                shares = [sum(float(abs(own[1 + k]).mid()) for own in self.rows) for k in range(len(shares))]
+            self.activated(weights, row, constants)
+        return self.models(shares)
+
     def models(self, weights: Sequence[float]) -> list[tm.Model]:
         """The outputs as models; ``weights`` split their errors between the coordinates."""
         count = len(self.rows)
@@ -336,14 +371,3 @@ class _Columns:
 def _size(terms: Sequence[arb]) -> arb:
     """A bound of a sum of terms times numbers in [-1, 1]."""
     return sum(map(abs, terms), _ZERO)
-
-
-def _models(network: Network, args: Sequence[tm.Model]) -> list[tm.Model]:
-    columns = _Columns(network, args)
-    shares = [0.0] * len(columns.linear)
-    for number, (weights, size, bias, row, constants) in enumerate(_matrices(network)):
-        columns.through(weights, size, bias)
-        if number == 0:
-            shares = [sum(float(abs(own[1 + k]).mid()) for own in columns.rows) for k in range(len(shares))]
-        columns.activated(weights, row, constants)
-    return columns.models(shares)

@@ -115,7 +115,7 @@ OPERATIONS: dict[str, Operation] = {
     "sin": function(balls.sin, lambda x: ts.circular(x)[0], lambda g, y, a: g.apply("cos", a), tm.sin),
     "cos": function(balls.cos, lambda x: ts.circular(x)[1], lambda g, y, a: g.neg(g.apply("sin", a)), tm.cos),
     "tan": function(
-        arb.tan, ts.tan, lambda g, y, a: g.add(g.const(1.0), g.apply("sq", y)), tm.tan, partial=True
+        balls.tan, ts.tan, lambda g, y, a: g.add(g.const(1.0), g.apply("sq", y)), tm.tan, partial=True
     ),
     "asin": function(balls.asin, ts.asin, lambda g, y, a: _arc_slope(g, 1.0, a), tm.asin, partial=True),
     "acos": function(balls.acos, ts.acos, lambda g, y, a: _arc_slope(g, -1.0, a), tm.acos, partial=True),

@@ -72,7 +72,7 @@ class Quadratic:
             if not stack:
                 return True
             if self.budget is not None:
-                self.budget.check()
+                self.budget.balls(3 * len(active) ** 2 + len(self.radius) * (2 * len(cuts) + 12))
             centre, radius = stack.pop()
             if not all(cut.meets(centre, radius) for cut in cuts):
                 continue

@@ -109,7 +109,7 @@ def tanh(x: Series) -> Series:
 
 
 def tan(x: Series) -> Series:
-    return integrated(x[0].tan(), lambda y: add(constant(arb(1), len(y) - 1), sq(y)), x)
+    return integrated(balls.tan(x[0]), lambda y: add(constant(arb(1), len(y) - 1), sq(y)), x)
 
 
 def atan(x: Series) -> Series:

@@ -171,17 +171,17 @@ def log(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
 
 
 def sin(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    s, c = v.sin_cos()
-    return s, c, -s / 2, -r.cos()
+    s, c = balls.sin_cos(v)
+    return s, c, -s / 2, -balls.cos(r)
 
 
 def cos(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    s, c = v.sin_cos()
-    return c, -s, -c / 2, r.sin()
+    s, c = balls.sin_cos(v)
+    return c, -s, -c / 2, balls.sin(r)
 
 
 def tan(v: arb, r: arb) -> tuple[arb, arb, arb, arb]:
-    t, whole = v.tan(), r.tan()
+    t, whole = balls.tan(v), balls.tan(r)
     slope, square = 1 + t * t, balls.power(whole, 2.0)
     return t, slope, t * slope, 2 * (1 + square) * (1 + 3 * square)
 

@@ -23,7 +23,7 @@ from certbound.checker.expressions import Graph, Program, Undecided
 from certbound.checker.linear.events import Windows
 from certbound.checker.linear.response import Piece
 from certbound.checker.reading import Record, entries, number, wholes
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import STEP, Budget, Unproved
 from certbound.checker.statement import Model
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape
@@ -94,7 +94,7 @@ class StateNoise:
         found = []
         budget.hold(len(times) * n * columns)
         for k, ((start, end), hull) in enumerate(zip(times, hulls)):
-            budget.check()
+            budget.balls(n * (2 + len(hull)) + 2 * n * columns)
             inputs = [start.union(end)]
             for j in range(n):
                 value = hull[0][j]
@@ -151,7 +151,9 @@ class Stopped:
 
     def __init__(self, windows: Windows, excess: Sequence[arb_mat], factor: arb, budget: Budget) -> None:
         self.windows, self.excess, self.budget = windows, excess, budget
-        budget.hold(len(excess) * windows.n * (windows.n + (excess[0].ncols() if excess else 0)))
+        width = windows.n + (excess[0].ncols() if excess else 0)
+        budget.hold(len(excess) * windows.n * width)
+        budget.products(len(excess), windows.n, 2 * windows.n * windows.n + 12 * width)
         self.sizes = [magnitude(g) for g in excess]
         one = identity(windows.n)
         self.bends = [_bend(piece) for piece in windows.pieces]
@@ -173,7 +175,7 @@ class Stopped:
             late = arb_mat(count, n, [x for row in rows for x in row])
             main, rest = [arb(0)] * count, [arb(0)] * count
             for k in range(end - 1, -1, -1):
-                self.budget.check()
+                self.budget.products(count, n, 2 * n + 3 * self.excess[k].ncols() + 40)
                 early = late * windows.pieces[k].transition
                 half = windows.pieces[k].length / 2
                 ends = [_squares(row * self.excess[k]) for row in (late, early)]
@@ -189,6 +191,7 @@ class Stopped:
         """Levels along rows, on the pieces where they are asked."""
         spans = [self.windows.spans(item.rows, [level is not None for level in item.levels]) for item in families]
         chosen = []
+        self.budget.spend(STEP * len(self.windows.starts) * (1 + len(families)))
         for w in range(len(self.windows.starts)):
             chosen.append([number for number, (directions, _) in enumerate(spans) if directions[w] is not None])
         rows = [
@@ -204,6 +207,7 @@ class Stopped:
                 kappa = found[w].get(place)
                 if kappa is None:
                     continue
+                self.budget.balls(len(costs), 150)
                 pieces = [k for k in costs if start <= k < end]
                 if item.factors is None:
                     total += _beyond(item.levels, costs, pieces, kappa)

@@ -20,11 +20,13 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import below_and_above, diagonal, identity, magnitude, quadratic, tail, upper
 from certbound.checker.linear.response import Piece
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import FUNCTION, Budget, Unproved
 
 _NEGLIGIBLE = 1e-3
 MOST_ENTRIES = 1_000_000
 """Numbers beyond which what bounded noise does at most is not looked at: some 100 MB."""
+_JOINT = 1_000_000
+"""Units of work of a joint probability; 200 to 400 us measured."""
 
 Level = arb | None
 
@@ -59,6 +61,7 @@ class _Pair:
 
 def union_of_pairs(pairs: Sequence[_Pair], budget: Budget) -> arb:
     """Upper bound of the sum: the joint probability where it matters, the plain tail elsewhere."""
+    budget.balls(len(pairs), 2 * FUNCTION)
     tails = [pair.tail() for pair in pairs]
     total = sum(tails, arb(0))
     if total.is_zero():
@@ -68,7 +71,7 @@ def union_of_pairs(pairs: Sequence[_Pair], budget: Budget) -> arb:
         if value * len(pairs) < _NEGLIGIBLE * total:
             result += value
             continue
-        budget.check()
+        budget.balls(1, _JOINT)
         result += arb.min(value, pair.joint())
     return upper(result)
 
@@ -81,7 +84,7 @@ def chain(
     pairs: list[_Pair] = []
     previous: tuple[arb_mat, Level, arb] | None = None
     for k, (row, level) in enumerate(zip(rows, levels)):
-        budget.check()
+        budget.products(len(row), 3 * len(row) + 30)
         flat = arb_mat(1, len(row), list(row))
         variance = _variance(flat, covariances[k])
         if level is not None:
@@ -106,14 +109,14 @@ def sub_gaussian(
     """
     total = arb(0)
     for k, (row, level) in enumerate(zip(rows, levels)):
-        budget.check()
+        budget.products(len(row) + 8, len(row) + 30)
         if level is None:
             continue
         flat = arb_mat(1, len(row), list(row))
         variance = _variance(flat, proxies[k]).upper()
         if not level >= 0:
             return arb(1)
-        if variance.is_zero() or (drives is not None and level >= _reach(flat, drives[k])):
+        if variance.is_zero() or (drives is not None and level >= _reach(flat, drives[k], budget)):
             continue
         total += (-level * level / (2 * variance)).exp()
     return upper(total)
@@ -131,10 +134,11 @@ def bounded_drives(
     if entries > MOST_ENTRIES:
         return None
     budget.hold(entries)
+    budget.products(n, m, m)
     fresh = matrix * diagonal(list(halfwidth))
     found = [arb_mat(n, 0)]
     for transition in transitions:
-        budget.check()
+        budget.products(n, n + 10, found[-1].ncols() + m)
         before = transition * found[-1] if found[-1].ncols() else found[-1]
         found.append(arb_mat([[*old, *new] for old, new in zip(_rows(before), fresh.tolist())]))
     return found
@@ -144,10 +148,11 @@ def _rows(a: arb_mat) -> list[list[arb]]:
     return a.tolist() if a.ncols() else [[] for _ in range(a.nrows())]
 
 
-def _reach(flat: arb_mat, drive: arb_mat) -> arb:
+def _reach(flat: arb_mat, drive: arb_mat, budget: Budget) -> arb:
     """The largest value of a row where all noise does its worst."""
     if not drive.ncols():
         return arb(0)
+    budget.products(flat.ncols() + 10, drive.ncols())
     return upper(sum((abs(x) for x in (flat * drive).entries()), arb(0)))
 
 
@@ -175,7 +180,7 @@ class Windows:
         for start, end in zip(self.starts, self.ends):
             later = one
             for k in range(end - 1, start - 1, -1):
-                budget.check()
+                budget.products(self.n, self.n, 8 * self.n + 40)
                 try:
                     after = later.inv()
                     earlier = later * pieces[k].transition
@@ -214,6 +219,7 @@ class Windows:
                     value = (level - costs[k]).lower()
                     least = value if least is None else arb.min(least, value)
             tops.append(least)
+        self.budget.balls(4 * len(levels))
         nothing = [arb(0)] * self.n
         return self._chain([nothing if direction is None else direction for direction in directions], tops)
 
@@ -224,7 +230,8 @@ class Windows:
         directions: list[list[arb] | None] = []
         costs: dict[int, arb] = {}
         for window, (start, end) in enumerate(zip(self.starts, self.ends)):
-            self.budget.check()
+            count = sum(asked[start:end])
+            self.budget.balls((1 + count) * 24 * self.n)
             ends = {k: self._ends(rows[k], k) for k in range(start, end) if asked[k]}
             if not ends:
                 directions.append(None)
@@ -240,7 +247,7 @@ class Windows:
         return directions, costs
 
     def _ends(self, row: Sequence[arb], k: int) -> tuple[list[arb], list[arb]]:
-        self.budget.check()
+        self.budget.products(3, self.n, self.n + 20)
         flat = arb_mat(1, self.n, list(row))
         return (flat * self.before[k]).entries(), (flat * self.back[k]).entries()
 
@@ -260,7 +267,7 @@ class Windows:
         pairs = []
         previous: tuple[arb_mat, Level, arb] | None = None
         for window, (direction, level) in enumerate(zip(directions, levels)):
-            self.budget.check()
+            self.budget.products(4, self.n, self.n + 30)
             flat = arb_mat(1, self.n, list(direction))
             first, last = flat * self.forward[window], self.covariances[self.ends[window]]
             begin = self.covariances[self.starts[window]]

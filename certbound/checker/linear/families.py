@@ -58,6 +58,7 @@ def correlated(
     stay, rest = arb(1), arb(0)
     open_ = list(range(len(families)))
     while open_:
+        budget.spend(200 * (1 + len(open_)))
         i = open_.pop(0)
         first = families[i]
         if first.both:
@@ -79,8 +80,11 @@ def correlated(
 
 def _opposite(first: Sequence[Sequence[arb]], second: Sequence[Sequence[arb]], budget: Budget) -> bool:
     """Whether the rows are exactly opposite, entry by entry."""
-    budget.check()
-    return all(a == -b for one, other in zip(first, second) for a, b in zip(one, other))
+    for one, other in zip(first, second):
+        budget.balls(1 + len(one))
+        if any(a != -b for a, b in zip(one, other)):
+            return False
+    return True
 
 
 def _least(a: arb | None, b: arb | None) -> arb | None:

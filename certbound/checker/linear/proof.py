@@ -33,12 +33,13 @@ from certbound.checker.linear.response import (
     discrete_piece,
     over_piece,
     supports,
+    work_of_piece,
 )
 from certbound.checker.linear.samplers import raised
 from certbound.checker.linear.shared import Shared
 from certbound.checker.reading import Record, number, numbers, wholes
 from certbound.checker.reading import entries as listed
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import PRODUCT, Budget, Unproved
 from certbound.checker.statement import Grid, Model, cells_of, demands, structure_of
 from certbound.checker.words import named
 from certbound.errors import CertificateError
@@ -129,7 +130,8 @@ class _Cell:
         self.budget.hold((len(units) + self.shared.count * extra) * (n // 8 + 1))  # of the same 0
         fixed = [[one if j == unit else zero for j in range(n)] for unit in units]
         for item in numbers(given, record.at("rows"), self.shared.count, extra, len(units)):
-            self.budget.check()
+            self.budget.balls(1 + extra * (n // 4 + 1))
+            self.budget.take(8 * (len(fixed) + extra))
             whole = list(fixed)
             for row in item:
                 full = [zero] * n
@@ -167,7 +169,10 @@ class _Cell:
 
     def probability(self, outputs: Sequence[OutputRemainder]) -> arb:
         """Upper bound of the probability that this cell's paths break a constraint."""
+        self.budget.expect(self.shared.count * sum(output.expansion.work for output in outputs))
         self.pieces = self._pieces()
+        n = self.model.dimension
+        self.budget.products(len(self.pieces), n, n, 2 * n + 12)
         unit, back = diagonal(self.natural), diagonal([1 / value for value in self.natural])
         grown = [row_sums(back * piece.transition * unit) for piece in self.pieces]
         growth = sum(max(0.0, float(factor.log() / arb.const_log2())) for factor in grown)
@@ -214,11 +219,14 @@ class _Cell:
 
         A bound that is the same for all entries widens in other units wherever states hardly drive each other.
         """
-        largest = identity(self.model.dimension) * 0
+        n = self.model.dimension
+        self.budget.products(len(self.slopes), n, n, 24)
+        self.budget.products(20, n, n, 12)  # `balance`
+        largest = identity(n) * 0
         for slopes in self.slopes:
             largest = largest + magnitude(self.shared.structure.states.matrix(slopes))
         if self.model.continuous and row_sums(largest) * self.shared.length <= _MILD * len(self.slopes):
-            return [arb(1)] * self.model.dimension
+            return [arb(1)] * n
         return balance(largest)
 
     def _pieces(self) -> list[Piece]:
@@ -227,8 +235,11 @@ class _Cell:
         self.budget.hold(self.shared.count * self.model.dimension**2 * (8 if self.model.continuous else 4))
         result = []
         jacobian = shared.structure.states
+        n = self.model.dimension
+        if self.model.continuous and self.shared.sampler is None:
+            self.budget.expect(self.shared.count * math.prod(work_of_piece(n)) * PRODUCT)
         for k, (slope, drifts) in enumerate(zip(map(jacobian.matrix, self.slopes), self.drifts)):
-            self.budget.check()
+            self.budget.products(*(work_of_piece(n) if self.model.continuous else (n, n, 8)))
             noise = fixed if state is None else state.noise(k)
             if (number_ := shared.sampled(k)) is not None:
                 result.append(self.sampler.piece(self.sampled[number_]))
@@ -242,6 +253,9 @@ class _Cell:
     def _supports(self) -> Supports:
         """Bounds of y and R along the rows of levels and demands, over every piece."""
         n, count, continuous = self.model.dimension, self.shared.count, self.model.continuous
+        self.budget.products(count, n, n + 20)  # loads
+        self.budget.products(count, n, len(self.reach) * (n + 40) + 1)
+        self.budget.take(16 * sum(map(len, self.rows)) + 16 * count * len(self.demands))
         one = identity(n)
         unit = [[one[i, j] for j in range(n)] for i in range(n)]
         inner = self.rows if continuous else [*self.rows, []]
@@ -251,8 +265,8 @@ class _Cell:
         loads = [self._load(k) for k in range(count)]
         nodes: list[list[list[arb]]] = []
         for k in range(count + 1):
-            self.budget.check()
             own = asked[k] if k < len(asked) else []
+            self.budget.products(len(own) + 1, n, n + 20)
             if not continuous:
                 nodes.append(own)
             elif k < count:
@@ -265,7 +279,7 @@ class _Cell:
             return found
         parts = []
         for k in range(count):
-            self.budget.check()
+            self.budget.products(len(asked[k]) + 6, n, 2 * len(self.reach) + n + 60)
             gain = self._gain(k)
             parts.append(
                 over_piece(self.pieces[k], asked[k], found, k, self._box(k), None if gain is None else gain[1])
@@ -306,6 +320,7 @@ class _Cell:
         self, k: int, bounds: Supports, levels: Sequence[arb], outputs: Sequence[OutputRemainder]
     ) -> None:
         """beta lies in B on piece k, where Z and M keep to their levels; s lies in H."""
+        self.budget.balls(16 * self.model.dimension + 3 * len(self.slopes[0]) + 8 * len(levels))
         data, hidden_of, scale = self._data(k), self.shared.hidden, arb(1)
         if (number_ := self.shared.sampled(k)) is not None:
             data = self.sampler.data(k, self.nominal[k], self.sampled[number_])
@@ -340,6 +355,8 @@ class _Cell:
         There beta misses what the piece's own row gives by at most D. All bounds of R rest on integrals of |beta - m|
         over a piece, m the middle of B: with beta elsewhere as much inside of B as that part times D, they hold.
         """
+        if self.model.changes is not None:
+            self.budget.balls(10 * (1 + len(self.model.changes[0].low)))
         found = self.shared.beside(k)
         if found is None:
             return [arb(0)] * len(outputs)
@@ -383,7 +400,7 @@ class _Cell:
         count, inner = self.shared.count, len(self.rows[0])
         result: list[list[arb | None]] = []
         for number_, demand in enumerate(self.demands):
-            self.budget.check()
+            self.budget.balls(6 * count)
             rooms: list[arb | None] = []
             for k, room in enumerate(demand.rooms):
                 place = number_ + (inner if k < count else 0)

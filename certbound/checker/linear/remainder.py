@@ -138,7 +138,7 @@ class OutputRemainder:
         disturbances: list[int], dimension: int, budget: Budget,
     ) -> None:
         self.count, self.dimension, self.states, self.disturbances = count, dimension, states, disturbances
-        self.time = time
+        self.time, self.budget = time, budget
         self.slots = [*([0] if time else []), *(1 + j for j in states), *(1 + dimension + j for j in disturbances)]
         self.expansion = Expansion(graph, node, value, variables=count)
         self.plain = Program(graph, [], [value], variables=count)
@@ -171,6 +171,8 @@ class OutputRemainder:
                 return True
             budget.box()
             box = stack.pop()
+            size = len(box.centre)
+            budget.balls(size * (8 + 4 * len(frame.cuts)) + (0 if frame.straight else 2 * len(frame.map) ** 2))
             if not frame.meets(box):
                 continue
             form = self._form(frame, box)
@@ -265,6 +267,9 @@ class _Frame:
         self.output, self.polytope = output, polytope
         states = output.states
         m = len(states)
+        rows = len(polytope.rows)
+        output.budget.products(m, m + rows, m + 20)
+        output.budget.balls(rows * (len(polytope.rows[0]) if rows else 0), 100)
         self.start = 1 if output.time else 0
         chosen = list(polytope.frame)
         if len(chosen) != m or any(not _lives_in(polytope.rows[row], states) for row in chosen):

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from flint import arb, arb_mat, ctx
 
 from certbound.checker.balls import column, diagonal, identity, magnitude, row_sums
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import PRODUCT, Budget, Unproved
 
 _TERMS = 60
 """Of a series at the precision of a check; more at higher ones."""
@@ -141,6 +141,12 @@ def _piece(slope: arb_mat, drift: arb_mat, length: arb, noise: arb_mat) -> Piece
     )
 
 
+def work_of_piece(n: int) -> tuple[int, int]:
+    """Products of matrices of n states that `continuous_piece` takes at most, as a shape."""
+    terms = max(_TERMS, _TERMS * ctx.prec // 128)
+    return n * n, 8 * terms * (n + 4) + 40 * n
+
+
 def discrete_piece(slope: arb_mat, noise: arb_mat) -> Piece:
     """The data of one step in discrete time; ``noise`` is the covariance of what is added."""
     one = identity(slope.nrows())
@@ -164,9 +170,10 @@ def jump_piece(matrix: arb_mat, length: arb) -> Piece:
 def covariances(pieces: Sequence[Piece], start: arb_mat, budget: Budget) -> list[arb_mat]:
     """Covariances of Z at the nodes: V_{k+1} = F V_k F^T + Q."""
     result = [start]
-    budget.hold(len(pieces) * start.nrows() ** 2)
+    n = start.nrows()
+    budget.hold(len(pieces) * n**2)
     for piece in pieces:
-        budget.check()
+        budget.products(n, n, 2 * n + 12)
         v = piece.transition * result[-1] * piece.transition.transpose() + piece.noise
         result.append((v + v.transpose()) * arb(0.5))
     return result
@@ -211,6 +218,7 @@ def supports(
     size: list[list[arb]] = [[] for _ in rows]
     pairs = [(node, row) for node, own in enumerate(rows) for row in own]
     most = max(1, min(_ROWS, int(_BLOCK / (n * n))))
+    budget.expect(sum(node * n * n for node, _ in pairs) * PRODUCT)
     for first in range(0, len(pairs), most):
         part = pairs[first : first + most]
         centre, spread = _carried(part, transitions, columns, start, budget)
@@ -232,7 +240,9 @@ def _carried(
     n, left = transitions[0].nrows(), len(pairs)
     rows, centre, spread = arb_mat(0, n), arb_mat(0, 1), arb_mat(0, 2)
     for node in range(pairs[-1][0], -1, -1):
-        budget.check()
+        _, _, segments = columns[node - 1] if node else columns[0]
+        width = n + 12 if segments is None else 2 * segments.ncols() + n + 12
+        budget.products(len(pairs) - left, n, width)
         own = left
         while left and pairs[left - 1][0] == node:
             left -= 1

@@ -10,7 +10,7 @@ from flint import arb
 
 from certbound.checker.linear.samplers import sampler_of
 from certbound.checker.reading import Record, wholes
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import STEP, Budget, Unproved
 from certbound.checker.statement import Model, Structure
 from certbound.errors import CertificateError
 
@@ -32,6 +32,7 @@ class Shared:
             if given != expected:
                 raise Unproved(f"`proof.{name}` does not list the entries of the Jacobian that vary")
         self.units = wholes(record["units"], record.at("units"), 0, model.dimension - 1)
+        budget.spend(4 * STEP * model.dimension * (model.dimension + len(model.disturbance)))  # for `hidden`
         if len(set(self.units)) != len(self.units):
             raise CertificateError("`proof.units` must be different states.")
         self.hidden = [structure.hidden(model, output) for output in range(model.dimension)]

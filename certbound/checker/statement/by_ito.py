@@ -18,6 +18,7 @@ from flint import arb, arb_mat, fmpq
 
 from certbound.checker.balls import matrix
 from certbound.checker.reading import Record, wholes
+from certbound.checker.report import FUNCTION, STEP, Budget
 from certbound.checker.statement.problem import Initial, Model
 from certbound.checker.statement.regions import Constraint
 from certbound.errors import CertificateError
@@ -25,6 +26,8 @@ from certbound.problem.model import Node, Tape
 
 _MOST = 40  # states
 _LONGEST = 20_000  # operations
+_WORK, _BYTES = 15_000, 700
+"""Units of work and memory of an operation that is written, with its exact number where it has one."""
 
 
 def logarithmic_model(model: Model, record: Record) -> Model:
@@ -45,7 +48,11 @@ def logarithmic_model(model: Model, record: Record) -> Model:
     for i in chosen:
         if not any(_keeps_positive(one, i) for one in model.constraints):
             raise CertificateError(f"{place} must name states that a limit for all time keeps positive.")
-    dynamics, noise = _derived(model.dynamics, model.noise.diffusion, chosen)
+    given, budget = model.noise.diffusion, model.budget
+    dynamics, noise = budget.once(  # for all members of a union
+        model.dynamics, ("logarithms", given, *chosen), lambda: _derived(model.dynamics, given, chosen, budget)
+    )
+    budget.balls(len(chosen) * (1 + sum(1 + len(one.region.faces) for one in model.constraints)), FUNCTION)
     return replace(
         model, dynamics=dynamics, noise=replace(model.noise, diffusion=noise), by_ito=True,
         initial=_start(model.initial, chosen),
@@ -109,10 +116,12 @@ def _above(value: arb) -> float:
     return found
 
 
-def _derived(dynamics: Tape, diffusion: Tape, chosen: Sequence[int]) -> tuple[Tape, arb_mat | Tape]:
+def _derived(
+    dynamics: Tape, diffusion: Tape, chosen: Sequence[int], budget: Budget
+) -> tuple[Tape, arb_mat | Tape]:
     """The rates and what multiplies the noise; the latter is a matrix where no entry depends on anything."""
     n, m = diffusion.shape
-    writer = _Writer(len(dynamics.inputs))
+    writer = _Writer(len(dynamics.inputs), budget)
     rates, gains = writer.copied(dynamics), writer.copied(diffusion)
     for i in chosen:
         entries = gains[i * m : (i + 1) * m]
@@ -160,13 +169,16 @@ def _asked(nodes: Sequence[Node], outputs: Sequence[int]) -> list[bool]:
 class _Writer:
     """Operations written one after the other, none twice; ``numbers`` are their values where they are known exactly."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, budget: Budget) -> None:
+        self.budget = budget
         self.nodes: list[Node] = []
         self.numbers: list[Fraction | None] = []
         self._places: dict[Node, int] = {}
         self.inputs = [self._write(Node("input", (slot,)), None) for slot in range(count)]
 
     def _write(self, node: Node, number: Fraction | None) -> int:
+        self.budget.spend(_WORK + 50 * len(node.args))
+        self.budget.take(_BYTES)
         place = self._places.setdefault(node, len(self.nodes))
         if place == len(self.nodes):
             self.nodes.append(node)
@@ -179,6 +191,7 @@ class _Writer:
 
     def put(self, op: str, *args: int) -> int:
         """An operation; one of numbers is a number where that is a float, and a factor of 1 is left out."""
+        self.budget.spend(_WORK)
         known = [self.numbers[arg] for arg in args]
         given = [number for number in known if number is not None]
         if len(given) == len(args):
@@ -212,6 +225,7 @@ class _Writer:
 
     def quotients(self, slot: int, wanted: Sequence[int]) -> list[int]:
         """The wanted operations divided by an input: without a division where it is a factor, of sums term by term."""
+        self.budget.spend(len(self.nodes) * STEP)
         x, kept = self.inputs[slot], _asked(self.nodes, wanted)
         factors: dict[int, int] = {x: self.const(Fraction(1))}
         found: dict[int, int] = {}

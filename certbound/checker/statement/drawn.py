@@ -15,6 +15,7 @@ from itertools import combinations, pairwise
 from flint import arb
 
 from certbound.checker.reading import Record, text
+from certbound.checker.report import BALL, FUNCTION, Budget
 from certbound.checker.words import quoted
 from certbound.errors import CertificateError
 
@@ -35,6 +36,12 @@ class Drawn:
     mean: float
     below: Callable[[arb], arb] | None = None
     atoms: tuple[tuple[float, arb], ...] = ()
+    size: int = 1  # of the law's table
+
+    @property
+    def work(self) -> int:
+        """Units of work of one probability."""
+        return 3 * FUNCTION + 12 * BALL * self.size
 
     def probability(self, low: float, high: float) -> arb:
         """P(low <= constant <= high)."""
@@ -88,7 +95,7 @@ def _tabled(name: str, record: Record, place: int, mean: float, size: float) -> 
         values = [mean + size * row for row in rows]
         if not all(map(math.isfinite, values)) or len(set(values)) < len(values):
             raise CertificateError(f"`{tables.at('values')}` must be different finite numbers.")
-        return Drawn(place=place, mean=mean, atoms=tuple(zip(values, shares)))
+        return Drawn(place=place, mean=mean, atoms=tuple(zip(values, shares)), size=len(values))
     centre = sum((p * (arb(a) + arb(b)) / 2 for p, (a, b) in zip(shares, pairwise(rows))), arb(0))
 
     def below(x: arb) -> arb:
@@ -98,7 +105,7 @@ def _tabled(name: str, record: Record, place: int, mean: float, size: float) -> 
             found += share * _clipped((at - arb(a)) / (arb(b) - arb(a)))
         return found
 
-    return Drawn(place=place, mean=mean, below=below)
+    return Drawn(place=place, mean=mean, below=below, size=len(shares))
 
 
 def _clipped(x: arb) -> arb:
@@ -125,8 +132,10 @@ _BELOW: dict[str, Callable[[arb], arb]] = {
 """P(w <= x) of laws of size 1."""
 
 
-def weights_of(constants: Sequence[Drawn], cells: Sequence[Sequence[Range]]) -> list[arb]:
+def weights_of(constants: Sequence[Drawn], cells: Sequence[Sequence[Range]], budget: Budget) -> list[arb]:
     """The probability of every cell, a range a constant; CertificateError where two cells overlap."""
+    budget.spend(len(cells) * (len(constants) + 1) * len(cells) * BALL)
+    budget.balls(len(cells), sum(constant.work for constant in constants))
     for (i, one), (j, other) in combinations(enumerate(cells), 2):
         if not any(constant.apart(a, b) for constant, a, b in zip(constants, one, other)):
             raise CertificateError(f"`proof.cells` must not overlap; number {i + 1} and number {j + 1} do.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise, product
 
-from flint import arb
+from flint import arb, arb_mat
 
 from certbound.checker.balls import cholesky, column
 from certbound.checker.reading import Record, number, numbers, whole
@@ -34,16 +34,19 @@ def cells_of(model: Model, record: Record) -> list[list[tuple[arb, arb]]]:
         count *= len(sides[-1])
         if count > MOST_CELLS:
             raise CertificateError(f"`proof.splits` must make at most {MOST_CELLS} cells.")
+    model.budget.take(count * (120 + 8 * model.dimension))
+    model.budget.spend(count * (1_000 + 20 * model.dimension))
     boxes = [list(box) for box in product(*sides)]
-    return boxes if record["cuts"] is None else _cut(boxes, record, model.dimension)
+    return boxes if record["cuts"] is None else _cut(boxes, record, model)
 
 
-def _cut(boxes: list[list[tuple[arb, arb]]], record: Record, dimension: int) -> list[list[tuple[arb, arb]]]:
+def _cut(boxes: list[list[tuple[arb, arb]]], record: Record, model: Model) -> list[list[tuple[arb, arb]]]:
     """The parts of one box, in order: an entry of ``cuts`` says where the next part is cut, or null that it is a cell.
 
     Both parts of a cut follow it, the lower one with all its own cuts first. Each cut lies inside its part, so that
     the parts cover what is cut.
     """
+    dimension = model.dimension
     if len(boxes) != 1:
         raise CertificateError("`proof.splits` must make one box where `proof.cuts` cuts it.")
     left, cells = boxes, []
@@ -51,6 +54,8 @@ def _cut(boxes: list[list[tuple[arb, arb]]], record: Record, dimension: int) -> 
         if not left:
             raise CertificateError("`proof.cuts` must end with its last cell.")
         box = left.pop()
+        model.budget.take(200 + 16 * dimension)
+        model.budget.spend(2_000 + 20 * dimension)
         if item is None:
             cells.append(box)
             continue
@@ -77,18 +82,22 @@ def starts_of(model: Model, record: Record) -> list[list[arb]]:
     """
     rows = record.items("starts", 1, MOST_STARTS)
     points = [list(map(arb, numbers(row, f"proof.starts[{k}]", model.dimension))) for k, row in enumerate(rows)]
-    if not all(_is_inside(model, point) for point in points):
+    n, shape = model.dimension, model.initial.shape
+    if shape is not None:
+        model.budget.products(n, n, n)
+    image = None if shape is None else cholesky(shape, model.budget).inv()
+    model.budget.products(len(points), n, 1 if shape is None else n)
+    if not all(_is_inside(model, point, image) for point in points):
         raise Unproved("a start was not shown to lie in the initial set")
     return points
 
 
-def _is_inside(model: Model, point: list[arb]) -> bool:
+def _is_inside(model: Model, point: list[arb], image: arb_mat | None) -> bool:
     initial = model.initial
     if initial.kind == "box":
         return all(low <= x <= high for low, x, high in zip(initial.low, point, initial.high))
     away = [x - arb(c) for x, c in zip(point, initial.centre)]
-    if initial.shape is not None:
-        image = (cholesky(initial.shape).inv() * column(away)).entries()
-        return bool(sum((x * x for x in image), arb(0)) <= 1)
+    if image is not None:
+        return bool(sum((x * x for x in (image * column(away)).entries()), arb(0)) <= 1)
     radius = arb(initial.radius)
     return bool(sum((x * x for x in away), arb(0)) <= radius * radius)

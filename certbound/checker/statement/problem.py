@@ -13,7 +13,7 @@ from flint import arb, arb_mat
 from certbound.checker.balls import diagonal, is_positive_definite, matrix
 from certbound.checker.reading import Record, number, numbers, text
 from certbound.checker.reading import entries as listed
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import STEP, Budget, Unproved, unlimited
 from certbound.checker.statement.drawn import Drawn, read_drawn
 from certbound.checker.statement.law_pieces import Piece
 from certbound.checker.statement.laws import LAWS, Law
@@ -51,6 +51,7 @@ class Noise:
     entries: tuple[arb, ...] = ()
     cut: Callable[[int], list[Piece]] | None = None
     halfwidth: tuple[arb, ...] | None = None
+    budget: Budget = field(default_factory=unlimited)
 
     def constant(self) -> arb_mat:
         """A constant matrix; CertificateError of a tape."""
@@ -63,6 +64,8 @@ class Noise:
         matrix = self.constant()
         if self.proxy is None:
             raise Unproved("the law of the noise has no variance proxy")
+        n, m = matrix.nrows(), matrix.ncols()
+        self.budget.products(n, m, n + m)
         return matrix * self.proxy * matrix.transpose()
 
 
@@ -119,6 +122,7 @@ class Model:
     by_ito: bool = False  # derived by Ito's formula: no disturbance sees coming noise then
     changes: list[Change] | None = None  # of rows that do not change just at the ends of equal pieces; at 0, ..., T
     members: tuple[Initial, ...] = ()  # of a start that is a union; ``initial`` is then a box around them all
+    budget: Budget = field(default_factory=unlimited)  # of the check that the problem was read for
 
     @property
     def dimension(self) -> int:
@@ -199,7 +203,7 @@ def read_model(value: object, budget: Budget, path: str = "problem") -> Model:
         drawn=read_drawn(record["random"], record.at("random"), disturbances),
         noise=_noise(record["noise"], path + ".noise", states, time, budget),
         initial=initial, members=members, target=_target(record, n, horizon, budget),
-        constraints=tuple(constraints), domain=domain,
+        constraints=tuple(constraints), domain=domain, budget=budget,
         stays="reach" in record.value and record["reach"].get("kind") == _STAYING,
     )
     _refuse_rounding(model, path)
@@ -215,7 +219,10 @@ def _refuse_rounding(model: Model, path: str) -> None:
     sets = [*model.constraints, *([] if model.target is None else [model.target])]
     given += [(constraint.region.center, steps) for constraint in sets]
     for tape, samples in given:
-        found = rounded_comparison(tape, float(steps or model.horizon), samples) if isinstance(tape, Tape) else None
+        if not isinstance(tape, Tape):
+            continue
+        with model.budget.passing():
+            found = rounded_comparison(tape, float(steps or model.horizon), samples, model.budget)
         if found is not None:
             raise CertificateError(f"`{path}` must not hold a comparison that rounding decides, got {found}.")
 
@@ -267,7 +274,7 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
         if record["law"] != "wiener":
             raise CertificateError(f"`{path}.law` must be \"wiener\" in continuous time.")
         drives, m = _drives(record, "diffusion", states)
-        return Noise(diffusion=drives, proxy=diagonal([arb(1)] * m), gaussian=True)
+        return Noise(diffusion=drives, proxy=diagonal([arb(1)] * m), gaussian=True, budget=budget)
     name = text(value.get("law") if isinstance(value, dict) else None, f"{path}.law", 200)
     if name not in LAWS:
         raise CertificateError(f"`{path}.law` must be one of {', '.join(LAWS)}, got {quoted(name, 40)}.")
@@ -278,11 +285,11 @@ def _noise(value: object, path: str, states: tuple[str, ...], time: str, budget:
     proxy, sizes = _proxy(record, law, m, budget)
     cut, halfwidth = law.cut, sizes if law.bounded else None
     if cut is None:
-        return Noise(diffusion=drives, proxy=proxy, gaussian=law.gaussian, halfwidth=halfwidth)
+        return Noise(diffusion=drives, proxy=proxy, gaussian=law.gaussian, halfwidth=halfwidth, budget=budget)
     found = [numbers(record["tables"][table], record.at(table), None) for table in law.tables]
     return Noise(
         diffusion=drives, proxy=proxy, gaussian=law.gaussian, uniform=sizes if law.uniform else None, entries=sizes,
-        cut=lambda count: cut(count, found), halfwidth=halfwidth,
+        budget=budget, cut=lambda count: cut(count, found), halfwidth=halfwidth,
     )  # fmt: skip
 
 
@@ -328,6 +335,7 @@ def _semidefinite(a: arb_mat, path: str, budget: Budget) -> arb_mat:
     It is judged in units in which every variance is 1, so that a large one hides nothing of a small one.
     """
     n = a.nrows()
+    budget.balls(6 * n * n)
     variances = [a[i, i] for i in range(n)]
     if not all(value >= 0 for value in variances):
         raise CertificateError(f"`{path}` must not have a negative variance.")
@@ -359,6 +367,7 @@ def met_at(model: Model, time: float) -> Model:
     """
     target = model.target
     assert target is not None
+    model.budget.spend(4 * STEP * (1 + len(model.constraints)))
     first, last = target.during or (0.0, model.horizon)
     if not (first <= time <= last and time > 0) or (not model.continuous and time != int(time)):
         raise CertificateError("`proof.time` must be a time of the target's window, after 0.")
@@ -385,6 +394,7 @@ def _starts(value: object, path: str, n: int, budget: Budget) -> tuple[Initial, 
     if not isinstance(value, dict) or value.get("kind") != "union":
         return _initial(value, path, n, budget), ()
     rows = Record(value, path, ("kind", "members")).items("members", 2, 1000)
+    budget.balls(2 * n * len(rows))
     members = tuple(_initial(row, f"{path}.members[{index}]", n, budget) for index, row in enumerate(rows))
     if any(member.covariance is not None for member in members):
         raise CertificateError(f"`{path}.members` must be sets, not random starts.")

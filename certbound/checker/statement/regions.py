@@ -58,29 +58,35 @@ class Region:
             full[place] = value
         return full
 
-    def image(self, dimension: int) -> tuple[arb_mat, arb]:
+    def image(self, dimension: int, budget: Budget) -> tuple[arb_mat, arb]:
         """W over all states and a bound with the region equal to {|W (x - center)| <= bound} (round ones).
 
         Of an ellipsoid {y^T shape^-1 y <= 1} it is the inverse of the Cholesky factor of its shape.
         """
         k = len(self.coordinates)
+        budget.hold(k * (k + dimension // 4))
+        budget.balls(2 * k * (k + dimension // 4))
         square, bound = identity(k), arb(self.radius)
         if self.shape is not None:
-            square, bound = cholesky(self.shape).inv(), arb(1)
+            budget.products(k, k, k)
+            square, bound = cholesky(self.shape, budget).inv(), arb(1)
         rows = [self.lift([square[i, j] for j in range(k)], dimension) for i in range(k)]
         return matrix(rows), bound
 
-    def support(self, row: Sequence[arb]) -> arb:
+    def support(self, row: Sequence[arb], budget: Budget) -> arb:
         """Upper bound of row . y over the region moved to the origin (round ones)."""
+        budget.products(len(row), len(row) if self.shape is not None else 6)
         if self.shape is None:
             square = sum((x * x for x in row), arb(0))
             return arb(self.radius) * square.upper().sqrt()
         flat = arb_mat(1, len(row), list(row))
         return quadratic(flat, self.shape, flat).upper().sqrt()
 
-    def inscribed(self) -> list[tuple[Row, arb]]:
+    def inscribed(self, budget: Budget) -> list[tuple[Row, arb]]:
         """Rows a and bounds b of a polyhedron {a . y <= b} inside the round region at the origin."""
         k = len(self.coordinates)
+        budget.hold(2 * k * k)
+        budget.products(k, k, 8 if self.shape is None else 3 * k)
         if k == 1:
             unit, scale = [[arb(1)], [arb(-1)]], arb(1)
         elif k == 2:
@@ -91,7 +97,7 @@ class Region:
             scale = 1 / arb(k).sqrt()
         if self.shape is None:
             return [(row, scale * arb(self.radius)) for row in unit]
-        factor = cholesky(self.shape).inv()
+        factor = cholesky(self.shape, budget).inv()
         return [((arb_mat(1, k, row) * factor).entries(), scale) for row in unit]
 
 
@@ -129,7 +135,7 @@ class Constraint:
             for row in rows:
                 budget.check()
                 turned = [arb(x) for x in row]
-                exact.append((turned, region.support(turned)))
+                exact.append((turned, region.support(turned, budget)))
             return exact
         faces: dict[int, tuple[Row, arb]] = {}
         found = []
@@ -149,6 +155,7 @@ class Constraint:
         """A combination of all faces by weights that are not negative."""
         region, faces = self.region, len(self.region.bounds)
         budget.hold(len(region.coordinates))
+        budget.balls(faces * (2 + len(region.coordinates)))
         weights = [arb(number(x, path, least=0.0)) for x in entries(value, path, faces, faces)]
         row = [
             sum((w * face[i] for w, face in zip(weights, region.faces) if face[i]), arb(0))

@@ -10,7 +10,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import column
 from certbound.checker.expressions import Graph, Program, Undecided
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, BALL_BYTES, PRODUCT, STEP, Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint, Region
 from certbound.errors import CertificateError
@@ -61,6 +61,7 @@ def demands(
     """
     if len(separations) != len(model.constraints):
         raise CertificateError(f"`{path}` must have {len(model.constraints)} entries, got {len(separations)}.")
+    budget.expect(len(model.constraints) * len(grid.times) * STEP)
     result: list[Demand] = []
     for number, (constraint, given) in enumerate(zip(model.constraints, separations)):
         if polygons or not (constraint.inside and constraint.region.round):
@@ -85,21 +86,26 @@ def _demand(
         face = [-x for x in region.face(0)]
         families = [[(face, -arb(region.bounds[0]) - _STRICT)] * count]
     elif region.round:
-        families = [[pair] * count for pair in region.inscribed()]
+        pairs = region.inscribed(budget)
+        budget.take(8 * len(pairs) * count)
+        families = [[pair] * count for pair in pairs]
     else:
+        budget.fits((8 + 2 * BALL_BYTES) * len(region.bounds) * count)
+        budget.take(8 * len(region.bounds) * count)
         families = [
             [(region.face(number), arb(b))] * count for number, b in enumerate(region.bounds)
         ]
     centres = centres_of(region, grid, budget)
     asked = grid.asked(constraint.during)
     found = []
+    budget.expect(sum(asked) * len(families) * model.dimension * BALL)
     for family in families:
         budget.hold(2 * count)
         found.append(Demand(label=constraint.label, rows=_lifted(region, family, model.dimension, budget), rooms=[]))
     for k in range(count):
         points = grid.points(k, constraint.during) if asked[k] else []
         for family, demand in zip(families, found):
-            budget.check()
+            budget.balls((1 + len(points)) * (10 + 2 * len(demand.rows[k])))
             row, bound = family[k]
             offset = bound + _dot(row, centres[k])
             rooms = [offset - _dot(demand.rows[k], point) for point in points]
@@ -110,9 +116,10 @@ def _demand(
 def _lifted(region: Region, family: list[tuple[list[arb], arb]], dimension: int, budget: Budget) -> list[list[arb]]:
     """The rows over all states; one that comes again is the same."""
     known: dict[int, list[arb]] = {}
+    budget.spend(len(family) * 200)
     for row, _ in family:
         if id(row) not in known:
-            budget.check()
+            budget.balls(dimension // 4)
             budget.hold(dimension // 8 + 1)  # most of it is the same 0
             known[id(row)] = region.lift(row, dimension)
     return [known[id(row)] for row, _ in family]
@@ -134,9 +141,10 @@ def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]
         region = constraint.region
         if not (constraint.inside and region.round):
             continue
-        image, bound = region.image(model.dimension)
+        image, bound = region.image(model.dimension, budget)
         asked, centres = grid.asked(constraint.during), centres_of(region, grid, budget)
         budget.hold(len(grid.times))
+        budget.expect(sum(asked) * image.nrows() * image.ncols() * PRODUCT)
         rooms: list[arb | None] = []
         for k in range(len(grid.times)):
             budget.check()
@@ -146,6 +154,8 @@ def round_demands(model: Model, grid: Grid, budget: Budget) -> list[RoundDemand]
             moved = region.lift(centres[k], model.dimension)
             sizes = []
             for point in grid.points(k, constraint.during):
+                budget.products(image.nrows(), image.ncols())
+                budget.balls(4 * (image.ncols() + image.nrows()))
                 offset = (image * column([a - b for a, b in zip(point, moved)])).entries()
                 sizes.append(sum((x * x for x in offset), arb(0)).upper().sqrt())
             rooms.append((bound + reduce(arb.min, [-size for size in sizes])).lower())
@@ -161,7 +171,7 @@ def centres_of(region: Region, grid: Grid, budget: Budget) -> list[list[arb]]:
     """Enclosures of the centre on every piece."""
     if not isinstance(region.center, Tape):
         return [[arb(x) for x in region.center]] * len(grid.times)
-    budget.hold(len(grid.times) * len(region.coordinates))
+    budget.hold(2 * len(grid.times) * len(region.coordinates))
     graph = Graph(budget)
     nodes = graph.include(region.center, [graph.input(0)])
     program = Program(graph, [nodes[output] for output in region.center.outputs], variables=1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from flint import arb
 
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import BALL, Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.checker.statement.regions import Constraint
 from certbound.checker.statement.rooms import Grid, centres_of
@@ -92,14 +92,15 @@ class _Shape:
         return (-high, -low) if self.outside else (low, high)
 
 
-def _shape_of(constraint: Constraint, center: Sequence[arb], dimension: int) -> _Shape | None:
+def _shape_of(constraint: Constraint, center: Sequence[arb], dimension: int, budget: Budget) -> _Shape | None:
     """A constraint whose region lies around ``center``; None where nothing is asked."""
     region = constraint.region
+    budget.balls((1 + len(region.faces)) * (dimension + 4))
     middle = [arb(0)] * dimension
     for place, value in zip(region.coordinates, center):
         middle[place] = value
     if region.round:
-        image, bound = region.image(dimension)
+        image, bound = region.image(dimension, budget)
         rows = [[image[i, j] for j in range(dimension)] for i in range(image.nrows())]
         bounds = [arb(0)] * len(rows)
     else:
@@ -114,23 +115,36 @@ def _shape_of(constraint: Constraint, center: Sequence[arb], dimension: int) -> 
     return _Shape(forms=forms, offsets=offsets, outside=not constraint.inside, bound=bound)
 
 
+def _size(shapes: Sequence[_Shape]) -> int:
+    """Operations of balls by which all shapes are looked at over a box."""
+    return sum(12 + 6 * (2 + len(form)) for shape in shapes for form in shape.forms)
+
+
 class StepSet:
     """The states that break no constraint at one step: windows, and where moving sets are then, count."""
 
     def __init__(self, model: Model, step: int, budget: Budget) -> None:
         asked = [c for c in model.constraints if c.during is None or c.during[0] <= step <= c.during[1]]
         now = Grid(times=[(arb(step), arb(step))], hulls=[])
-        shapes = [_shape_of(c, centres_of(c.region, now, budget)[0], model.dimension) for c in asked]
+        shapes = [_shape_of(c, centres_of(c.region, now, budget)[0], model.dimension, budget) for c in asked]
         self._shapes = [shape for shape in shapes if shape is not None]
+        self._budget, self._size = budget, _size(self._shapes)
+
+    @property
+    def work(self) -> int:
+        """Units of work of one look at a box."""
+        return self._size * BALL
 
     def holds(self, box: Sequence[Side], *, strictly: bool = False) -> bool:
         """Whether no point of a box breaks a constraint; ``strictly``: an obstacle must not be touched either."""
+        self._budget.balls(self._size + 6 * len(box))
         centre = [(a + b) / 2 for a, b in box]
         radius = [(b - a) / 2 for a, b in box]
         return all(shape.keeps(centre, radius, strictly=strictly) for shape in self._shapes)
 
     def excludes(self, box: Sequence[Side]) -> bool:
         """Whether every point of a box breaks a constraint, the same one."""
+        self._budget.balls(self._size + 6 * len(box))
         centre = [(a + b) / 2 for a, b in box]
         radius = [(b - a) / 2 for a, b in box]
         return any(shape.breaks(centre, radius) for shape in self._shapes)
@@ -157,7 +171,7 @@ class SafeSet:
     """
 
     def __init__(self, model: Model, *, bounded: bool = True) -> None:
-        self.n = model.dimension
+        self.n, self.budget = model.dimension, model.budget
         self.shapes: list[_Shape] = []
         low: list[arb | None] = [None] * self.n
         high: list[arb | None] = [None] * self.n
@@ -166,6 +180,7 @@ class SafeSet:
             if shape is not None:
                 self.shapes.append(shape)
                 self._narrow(shape, low, high)
+        self._size = _size(self.shapes)
         self.hull: list[Side] = []
         for j, (a, b) in enumerate(zip(low, high) if bounded else ()):
             if a is None or b is None:
@@ -180,7 +195,7 @@ class SafeSet:
             raise Unproved(f"\"{constraint.label}\" has a time window, which this proof does not treat")
         if isinstance(region.center, Tape):
             raise Unproved(f"\"{constraint.label}\" moves, which this proof does not treat")
-        return _shape_of(constraint, [arb(value) for value in region.center], self.n)
+        return _shape_of(constraint, [arb(value) for value in region.center], self.n, self.budget)
 
     def _narrow(self, shape: _Shape, low: list[arb | None], high: list[arb | None]) -> None:
         """Take what a constraint says about single states."""
@@ -205,10 +220,12 @@ class SafeSet:
 
     def excludes(self, centre: Sequence[arb], radius: Sequence[arb]) -> bool:
         """Whether every point of a box surely breaks a constraint, the same one."""
+        self.budget.balls(self._size)
         return any(shape.over(centre, radius)[0] > 0 for shape in self.shapes)
 
     def holds(self, centre: Sequence[arb], radius: Sequence[arb], *, strictly: bool = False) -> bool:
         """Whether no point of a box breaks a constraint; ``strictly``: an obstacle must not be touched either."""
+        self.budget.balls(self._size)
         return all(shape.keeps(centre, radius, strictly=strictly) for shape in self.shapes)
 
     def contains(self, box: Sequence[Side], budget: Budget) -> bool:
@@ -256,6 +273,7 @@ class SafeSet:
         form, offset = shape.forms[number], shape.offsets[number]
 
         def skip(centre: Sequence[arb], radius: Sequence[arb]) -> bool:
+            self.budget.balls(self._size)
             low, high = shape.over(centre, radius)
             if low > 0 or high < 0 or self.excludes(centre, radius):
                 return True

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from flint import arb, arb_mat
 
 from certbound.checker.expressions import Graph, Program, Undecided, is_partial
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import STEP, Budget, Unproved
 from certbound.checker.statement.problem import Model
 from certbound.problem.model import JUMPS
 
@@ -61,7 +61,9 @@ class Structure:
         asked &= ~sum(1 << 1 + j for j in self.states.active(output))
         asked &= ~sum(1 << first + j for j in self.disturbances.active(output))
         deciding = 0
-        for index in self.graph.reachable([self.outputs[output]]):
+        order = self.graph.reachable([self.outputs[output]])
+        self.graph.budget.spend(2 * STEP * len(order))
+        for index in order:
             deciding |= _deciding(self.graph, index)
         return [slot for slot in range(count) if deciding & asked & 1 << slot]
 

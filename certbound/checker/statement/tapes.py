@@ -158,7 +158,7 @@ def canonical(data: Mapping[str, Any]) -> list[Any]:
             if number_ in found:
                 stack.pop()
             elif missing:
-                stack.append(missing[0])
+                stack.extend(reversed(missing))
             else:
                 found[number_] = len(result)
                 own = [found[arg] for arg in args]

@@ -18,6 +18,7 @@ from flint import arb
 
 from certbound.checker.balls import matrix
 from certbound.checker.reading import Record
+from certbound.checker.report import Budget
 from certbound.checker.statement.by_ito import logarithmic_model
 from certbound.checker.statement.problem import Initial, Model, Noise
 from certbound.checker.statement.regions import Constraint
@@ -27,6 +28,10 @@ from certbound.problem.model import Node, Tape
 MOST_TURNED = 40
 """States of a problem in other coordinates."""
 _TERMS = 64
+_FRACTION, _NODE_WORK = 6_000, 4_000
+"""Units of work of a sum and product of fractions (2,000 to 5,000 ns measured), and of an operation that is written."""
+_TERM_BYTES, _NODE_BYTES = 300, 700
+"""Memory of a term of a sum, and of an operation in lists and tables."""
 
 Rows = list[list[Fraction]]
 Sum = tuple[dict[int, Fraction], Fraction]
@@ -63,6 +68,7 @@ def turned_model(model: Model, record: Record) -> Model:
         raise CertificateError(f"`{record.path}.engine` must not be \"coordinates\" for such a problem.")
     if n > MOST_TURNED:
         raise CertificateError(f"`{record.at('matrix')}` must be of at most {MOST_TURNED} states.")
+    model.budget.spend(n * n * (n + 2) * _FRACTION)
     turn, back = (
         [[Fraction(x) for x in row] for row in record.array(name, n, n)] for name in ("matrix", "inverse")
     )
@@ -72,10 +78,17 @@ def turned_model(model: Model, record: Record) -> Model:
     if model.domain is not None and any(model.domain[j] != (None, None) for j in moved):
         raise CertificateError("`problem.domain` bounds a state that the stated coordinates replace.")
     return replace(
-        model, dynamics=_composed(model.dynamics, turn, back), noise=_noise(model.noise, turn, back),
+        model, dynamics=_once(model.dynamics, turn, back, model.budget),
+        noise=_noise(model.noise, turn, back, model.budget),
         initial=_start(model.initial, turn),
-        constraints=tuple(_constraint(one, back, moved) for one in model.constraints),
+        constraints=tuple(_constraint(one, back, moved, model.budget) for one in model.constraints),
     )
+
+
+def _once(tape: Tape, turn: Rows, back: Rows, budget: Budget) -> Tape:
+    """The tape in other coordinates, made once where all members of a union take the same."""
+    key = tuple(tuple(row) for rows in (turn, back) for row in rows)
+    return budget.once(tape, ("coordinates", key), lambda: _composed(tape, turn, back, budget))
 
 
 def _start(initial: Initial, turn: Rows) -> Initial:
@@ -92,9 +105,10 @@ def _ball(value: Fraction) -> arb:
     return arb(float(value))
 
 
-def _noise(noise: Noise, turn: Rows, back: Rows) -> Noise:
+def _noise(noise: Noise, turn: Rows, back: Rows, budget: Budget) -> Noise:
     if isinstance(noise.diffusion, Tape):
-        return replace(noise, diffusion=_composed(noise.diffusion, turn, back))
+        return replace(noise, diffusion=_once(noise.diffusion, turn, back, budget))
+    budget.spend(noise.diffusion.ncols() * len(turn) ** 2 * _FRACTION)
     given = [[Fraction(float(x)) for x in row] for row in noise.diffusion.tolist()]
     rows = [[sum((c * x for c, x in zip(row, column)), Fraction(0)) for column in zip(*given)] for row in turn]
     if not all(_is_float(x) for row in rows for x in row):  # proofs take them for floats
@@ -102,8 +116,10 @@ def _noise(noise: Noise, turn: Rows, back: Rows) -> Noise:
     return replace(noise, diffusion=matrix([[float(x) for x in row] for row in rows]))
 
 
-def _constraint(constraint: Constraint, back: Rows, moved: set[int]) -> Constraint:
+def _constraint(constraint: Constraint, back: Rows, moved: set[int], budget: Budget) -> Constraint:
     region, n = constraint.region, len(back)
+    budget.spend((1 + len(region.faces)) * (1 + len(region.coordinates)) * n * _FRACTION)
+    budget.take(40 * n * len(region.faces))
     if not moved & set(region.coordinates):
         return constraint
     if region.round or isinstance(region.center, Tape) or any(region.center):
@@ -127,9 +143,9 @@ def _is_float(value: Fraction) -> bool:
         return False
 
 
-def _composed(tape: Tape, turn: Rows, back: Rows) -> Tape:
+def _composed(tape: Tape, turn: Rows, back: Rows, budget: Budget) -> Tape:
     """T . f(t, T^-1 y, ...), entry by entry."""
-    writer, n = _Writer(), len(back)
+    writer, n = _Writer(budget), len(back)
     given: list[Sum] = [({writer.put(Node("input", (slot,))): Fraction(1)}, Fraction(0))
                         for slot in range(len(tape.inputs))]  # fmt: skip
     given[1 : n + 1] = [writer.total(zip(row, given[1 : n + 1])) for row in back]
@@ -142,11 +158,14 @@ def _composed(tape: Tape, turn: Rows, back: Rows) -> Tape:
 class _Writer:
     """Operations written one after the other, none twice."""
 
-    def __init__(self) -> None:
+    def __init__(self, budget: Budget) -> None:
+        self.budget = budget
         self.nodes: list[Node] = []
         self._places: dict[Node, int] = {}
 
     def put(self, node: Node) -> int:
+        self.budget.spend(_NODE_WORK + 50 * len(node.args))
+        self.budget.take(_NODE_BYTES)
         place = self._places.setdefault(node, len(self.nodes))
         if place == len(self.nodes):
             self.nodes.append(node)
@@ -155,6 +174,7 @@ class _Writer:
     def total(self, parts: Iterable[tuple[Fraction, Sum]]) -> Sum:
         """The sum of sums by factors that are floats: merged, or where that is not exact, added as they stand."""
         kept = [(factor, part) for factor, part in parts if factor]
+        self.budget.spend(sum(2 + len(own) for _, (own, _) in kept) * 2 * _FRACTION)
         terms: dict[int, Fraction] = {}
         for factor, (own, _) in kept:
             for place, c in own.items():
@@ -162,6 +182,7 @@ class _Writer:
         terms = {place: c for place, c in terms.items() if c or self.nodes[place].op != "input"}
         constant = sum((factor * own for factor, (_, own) in kept), Fraction(0))
         if len(terms) <= _TERMS and _is_float(constant) and all(map(_is_float, terms.values())):
+            self.budget.take(_TERM_BYTES * len(terms))
             return terms, constant
         return {self._added([(factor, self.node(part)) for factor, part in kept]): Fraction(1)}, Fraction(0)
 
@@ -189,6 +210,8 @@ class _Writer:
         found: list[Sum] = []
         for node in tape.nodes:
             own = given if node.op == "input" else found
+            self.budget.take(_NODE_BYTES)
+            self.budget.spend(2 * _FRACTION + _NODE_WORK)
             found.append(self._value(node, [own[arg] for arg in node.args]))
         return [found[output] for output in tape.outputs]
 

@@ -8,6 +8,7 @@ import numpy as np
 from flint import arb
 
 from certbound.checker.expressions import OPERATIONS, Undecided
+from certbound.checker.report import FUNCTION, STEP
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Batch
 from certbound.problem.model import Tape
@@ -19,7 +20,11 @@ def run(tape: Tape, inputs: Sequence[Batch]) -> list[Batch]:
     """The outputs of a tape on N boxes; unknown where an operation is undefined or jumps somewhere on a box."""
     values: list[Batch] = []
     like = inputs[0]
-    for node in tape.nodes:
+    ended, most = tape.lives()
+    like.terms.budget.spend(STEP * len(tape.nodes))
+    like.terms.budget.fits(8 * (most + 8) * like.coefficients.size)
+    nothing = tm.fixed(like.terms, np.zeros(0))
+    for index, node in enumerate(tape.nodes):
         args = [] if node.op == "input" else [values[arg] for arg in node.args]
         if node.op == "input":
             values.append(inputs[node.args[0]])
@@ -33,6 +38,8 @@ def run(tape: Tape, inputs: Sequence[Batch]) -> list[Batch]:
             values.append(tm.composed(args[0], OPERATIONS[node.op].series))
         else:
             values.append(tm.unknown(like))  # atan2, parts of networks
+        for place in ended[index]:
+            values[place] = nothing
     return [values[output] for output in tape.outputs]
 
 
@@ -123,6 +130,7 @@ def _step(op: str) -> Callable[[Batch], Batch]:
     def apply(x: Batch) -> Batch:
         value, sure = np.zeros(x.error.shape), np.zeros(x.error.shape, dtype=bool)
         low, high = x.ends()
+        x.terms.budget.balls(len(low), FUNCTION)
         for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high)):
             try:
                 first, last = (OPERATIONS[op].ball(arb(float(end))) for end in (low[k], high[k]))

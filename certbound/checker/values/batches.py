@@ -14,10 +14,9 @@ times as many calls. Functions of one variable (``composed``) are expanded by ba
 from __future__ import annotations
 
 import bisect
-import itertools
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -28,6 +27,7 @@ import numpy.typing as npt
 from flint import arb
 
 from certbound.checker.expressions import Undecided
+from certbound.checker.report import FUNCTION, Budget, unlimited
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -37,6 +37,12 @@ Series = list[arb]
 _UNIT = 2.0**-52
 _UP = 1 + 2.0**-40
 _TINY = 1e-300
+_PAIR_BYTES, _PAIR_WORK = 150, 1_500
+"""Memory and units of work of a product of monomials that is kept."""
+_MOST_KEPT = 100_000
+"""Products of monomials of a table that serves later checks too."""
+_TABLE = 2_000_000
+"""Numbers of a table of Bernstein coefficients that is made at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,26 +54,60 @@ class Terms:
     exponents: tuple[tuple[int, ...], ...]
     kept: tuple[tuple[tuple[int, int], ...], ...]
     totals: tuple[int, ...]
+    budget: Budget
+
+    def numbers(self, boxes: int) -> int:
+        """Coefficients of a batch of so many boxes."""
+        return len(self.exponents) * boxes
 
 
-@lru_cache(maxsize=16)
-def terms(variables: int, degree: int) -> Terms:
+def terms(variables: int, degree: int, budget: Budget | None = None) -> Terms:
     """The monomials up to a total degree; the constant is the first, then come the variables themselves.
+
+    What is done with batches of them counts in the ``budget``.
 
     Examples
     --------
     >>> terms(2, 2).exponents
     ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     """
-    every = [a for a in itertools.product(range(degree + 1), repeat=variables) if sum(a) <= degree]
-    exponents = tuple(sorted(every, key=lambda a: (sum(a), [-x for x in a])))
+    limits = unlimited() if budget is None else budget
+
+    def make() -> Terms:
+        pairs = math.comb(2 * variables + degree, degree)
+        limits.spend(pairs * _PAIR_WORK)
+        limits.take(pairs * _PAIR_BYTES)
+        table = (_kept_table if pairs <= _MOST_KEPT else _table)(variables, degree)
+        return Terms(variables, degree, *table, limits)
+
+    return limits.once(Terms, (variables, degree), make)
+
+
+_Table = tuple[tuple[tuple[int, ...], ...], tuple[tuple[tuple[int, int], ...], ...], tuple[int, ...]]
+
+
+def _monomials(variables: int, total: int) -> Iterator[tuple[int, ...]]:
+    """The exponents of one total degree, high powers of the first variables first."""
+    if variables == 1:
+        yield (total,)
+        return
+    for power in range(total, -1, -1):
+        for rest in _monomials(variables - 1, total - power):
+            yield power, *rest
+
+
+def _table(variables: int, degree: int) -> _Table:
+    exponents = tuple(a for total in range(degree + 1) for a in _monomials(variables, total))
     place = {a: k for k, a in enumerate(exponents)}
     totals = tuple(sum(a) for a in exponents)
     kept = []
     for a, total in zip(exponents, totals):
         others = exponents[: bisect.bisect_right(totals, degree - total)]
         kept.append(tuple((j, place[tuple(map(operator.add, a, b))]) for j, b in enumerate(others)))
-    return Terms(variables, degree, exponents, tuple(kept), totals)
+    return exponents, tuple(kept), totals
+
+
+_kept_table = lru_cache(maxsize=16)(_table)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +129,8 @@ class Batch:
 
     def _parts(self) -> tuple[list[bool], Array]:
         """Which coefficients are not 0 everywhere, and the `sizes`."""
+        which, boxes = self.terms, len(self.error)
+        which.budget.floats(2 * which.numbers(boxes), len(which.exponents) + 2)
         present = np.any(self.coefficients, axis=1).tolist()
         found = np.zeros((self.terms.degree + 1, len(self.error)))
         for k, total in enumerate(self.terms.totals):
@@ -104,6 +146,9 @@ class Batch:
 
         def product(x: Batch) -> Batch:
             mine, one = (yours, two) if x is self else x._parts()
+            boxes = len(x.error)
+            pairs = min(sum(mine) * sum(yours), sum(len(which.kept[i]) for i, there in enumerate(mine) if there))
+            which.budget.floats((2 * pairs + which.degree**2) * boxes + 3 * which.numbers(boxes), pairs + which.degree)
             coefficients = np.zeros_like(x.coefficients)
             into = list(coefficients)
             for i, own in enumerate(x.coefficients):
@@ -134,7 +179,19 @@ class Batch:
 
     def sharp_ends(self) -> tuple[Array, Array]:
         """Bounds of all values from the Bernstein coefficients, between which a polynomial lies."""
+        which, boxes = self.terms, len(self.error)
+        most = max(1, _TABLE // (which.degree + 1) ** which.variables)
+        if boxes <= most:
+            return self._sharp_ends()
+        parts = [self.take(slice(k, k + most))._sharp_ends() for k in range(0, boxes, most)]
+        low, high = (np.concatenate(ends) for ends in zip(*parts))
+        return low, high
+
+    def _sharp_ends(self) -> tuple[Array, Array]:
         which, count = self.terms, self.terms.degree + 1
+        size = count**which.variables * len(self.error)
+        which.budget.fits(24 * size)
+        which.budget.floats(size * which.variables * (count // 2 + 2), len(which.exponents) + 10 * which.variables)
         table = np.zeros((count,) * which.variables + self.error.shape)
         for exponents, row in zip(which.exponents, self.coefficients):
             table[exponents] = row
@@ -150,6 +207,7 @@ class Batch:
 
     def take(self, places: Any) -> Batch:
         """Some of the boxes."""
+        self.terms.budget.floats(self.coefficients.size)
         return Batch(self.terms, self.coefficients[:, places], self.error[places])
 
 
@@ -169,6 +227,9 @@ def _to_bernstein(degree: int) -> Array:
 
 def joined(parts: list[Batch]) -> Batch:
     """The boxes of several batches."""
+    size = sum(part.coefficients.size for part in parts)
+    parts[0].terms.budget.fits(8 * size)
+    parts[0].terms.budget.floats(size, len(parts))
     return Batch(
         parts[0].terms, np.concatenate([part.coefficients for part in parts], axis=1),
         np.concatenate([part.error for part in parts]),
@@ -177,6 +238,8 @@ def joined(parts: list[Batch]) -> Batch:
 
 def fixed(which: Terms, value: Array, error: Array | float = 0.0) -> Batch:
     """Constants, each known up to an error."""
+    which.budget.fits(8 * which.numbers(len(value)))
+    which.budget.floats(which.numbers(len(value)))
     coefficients = np.zeros((len(which.exponents), len(value)))
     coefficients[0] = value
     return Batch(which, coefficients, np.broadcast_to(np.asarray(error, dtype=float), value.shape))
@@ -192,11 +255,13 @@ def variable(which: Terms, number: int, low: Array, high: Array) -> Batch:
 
 def unknown(like: Batch) -> Batch:
     """Nothing."""
+    like.terms.budget.floats(like.coefficients.size)
     return Batch(like.terms, np.zeros_like(like.coefficients), np.full(like.error.shape, np.inf))
 
 
 def chosen(where: Mask, x: Batch, y: Batch) -> Batch:
     """x where the mask holds, else y."""
+    x.terms.budget.floats(2 * x.coefficients.size)
     return Batch(
         x.terms, np.where(where, x.coefficients, y.coefficients), np.where(where, x.error, y.error)
     )
@@ -212,11 +277,13 @@ def known(x: Batch) -> Batch:
 
 def neg(x: Batch) -> Batch:
     """-x."""
+    x.terms.budget.floats(x.coefficients.size)
     return Batch(x.terms, -x.coefficients, x.error)
 
 
 def add(x: Batch, y: Batch) -> Batch:
     """x + y."""
+    x.terms.budget.floats(4 * x.coefficients.size, 8)
     coefficients = x.coefficients + y.coefficients
     error = x.error + y.error + np.abs(coefficients).sum(axis=0) * _UNIT
     return known(Batch(x.terms, coefficients, error * _UP))
@@ -229,6 +296,7 @@ def sub(x: Batch, y: Batch) -> Batch:
 
 def scaled(x: Batch, factor: Array | float, off: Array | float = 0.0) -> Batch:
     """x times real numbers that differ from the floats ``factor`` by at most ``off``."""
+    x.terms.budget.floats(5 * x.coefficients.size, 10)
     size = np.abs(x.coefficients).sum(axis=0)
     coefficients = x.coefficients * factor
     error = x.error * (np.abs(factor) + off) + size * off + np.abs(coefficients).sum(axis=0) * _UNIT + _TINY
@@ -247,7 +315,11 @@ def composed(x: Batch, function: Callable[[Series], Series]) -> Batch:
     """
     order = x.terms.degree
     reach = np.where(np.isfinite(x.error), x.reach(), np.inf)
+    x.terms.budget.floats(60 * len(reach), 20)
     pairs, back = np.unique(np.stack([x.value, reach], axis=1), axis=0, return_inverse=True)
+    x.terms.budget.balls(len(pairs) * (order + 2) ** 2 * 8)
+    x.terms.budget.balls(len(pairs) * (order + 8), FUNCTION)
+    x.terms.budget.fits(len(pairs) * (order + 2) * 100)
     table = np.array([_expanded(function, float(v), float(r), order) for v, r in pairs]).reshape(-1, order + 2)
     found = table[back.reshape(-1)].T
     rest = Batch(x.terms, np.concatenate([np.zeros((1, len(reach))), x.coefficients[1:]]), x.error)

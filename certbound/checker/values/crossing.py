@@ -23,13 +23,14 @@ solution.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from flint import arb
 
-from certbound.checker.report import Unproved
+from certbound.checker.report import FUNCTION, Unproved
 from certbound.checker.statement import SafeSet, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Array, Batch, Mask, Terms, above, below, terms
@@ -56,6 +57,8 @@ class Crossing(Passage):
 
     def crossed(self, stages: Sequence[Crossing]) -> arb:
         """The same over stages that follow each other, this one being the first; all are lowered."""
+        for stage in stages:
+            stage._expect()
         ceiling = max(stage.ceiling() for stage in stages)
         for stage in stages:
             stage.stopped = ceiling
@@ -73,6 +76,13 @@ class Crossing(Passage):
         kept = arb(ceiling).exp()
         left = found - most * arb(start).exp() * rest
         return arb.max((left - kept) / (1 - kept), arb(0)).lower()
+
+    def _expect(self) -> None:
+        """Refuse more patches than can be looked at, each of them once by the dynamics."""
+        if self.due is None:
+            which = terms(self._variables(), self.degrees[0], self.budget)
+            patches = (len(self.surface.times) - 1) * math.prod(self.surface.cells)
+            self.budget.expect(which.numbers(patches) * len(self.model.dynamics.nodes))
 
     def ceiling(self) -> float:
         """At least V where a path ends that has not failed."""
@@ -111,11 +121,13 @@ class Crossing(Passage):
     def _highest(self) -> float:
         """At least V, everywhere."""
         n, highest = self.model.dimension, -np.inf
-        which = terms(1 + n, 3 + 5 * n)
-        for first, last in self._chunks(self.surface):
-            patches = self.surface.patches(first, last)
+        which = terms(1 + n, 3 + 5 * n, self.budget)
+        for first, last, cells in self.surface.blocks():
+            patches = self.surface.patches(first, last, cells)
             if self.due is not None:
-                patches = patches.take(np.flatnonzero(np.tile(self.due.ravel(), last - first)))
+                patches = patches.take(np.flatnonzero(np.tile(self.due[cells].ravel(), last - first)))
+                if not patches.low.shape[1]:
+                    continue
             _, high = patches.derivative(which, (0,) * (n + 1)).sharp_ends()
             highest = max(highest, _most(high))
         if not highest < np.inf:
@@ -124,10 +136,7 @@ class Crossing(Passage):
 
     def _at_end(self) -> float:
         """At least V at the horizon."""
-        n = self.model.dimension
-        patches = self.surface.frozen(-1).patches(0, 1)
-        high = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[1]
-        return float(np.nextafter(_most(high) + self.lift, np.inf))
+        return float(np.nextafter(_most(self.last_ends()[1]) + self.lift, np.inf))
 
     def _on(self, axis: int, end: int) -> float:
         """At least V on a side of the grid."""
@@ -143,14 +152,17 @@ class Crossing(Passage):
         m = self.levels.least(low, high)
         inputs = self._inputs(patches, which)
         squares = self._squares(inputs)
-        corners = list(itertools.product(*(sorted({a, b}) for a, b in self.model.disturbance)))
+        ends = [sorted({a, b}) for a, b in self.model.disturbance]
+        many = math.prod(map(len, ends))
+        self.budget.floats(many * len(eps), many)
         best = np.full(len(eps), -np.inf)
-        for corner in corners:
+        for corner in itertools.product(*ends):
             pushed = [tm.fixed(which, np.full(len(eps), value)) for value in corner]
             found = self._balance(patches, inputs + pushed, squares, 1 + m, (1 + m) * 2.0**-52).sharp_ends()[0]
             best = np.where(np.isfinite(found), np.maximum(best, found), best)
-        if len(corners) > 1:
+        if many > 1:
             best = np.where(has_full_rank(squares), best, -np.inf)
+        self.budget.balls(len(eps), FUNCTION)
         reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
         need = (-best - eps * reach * (1 - 1e-12)) * (1 + 1e-12)
         need = np.where(np.isfinite(best), np.maximum(need, 0.0), np.inf)

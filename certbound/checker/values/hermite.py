@@ -14,19 +14,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 from flint import arb
 
-from certbound.checker.report import Unproved
+from certbound.checker.report import Budget, Unproved, unlimited
 from certbound.checker.values.batches import Array, Batch, Index, Terms, variable
 from certbound.errors import CertificateError
 
 _ROUNDING = 400 * 2.0**-53
 _UP = 1 + 2.0**-40
+_CHUNK = 4096
+"""Patches that are looked at together."""
+
+Block = tuple[int, int, tuple[slice, ...]]
+"""First slab, the slab behind the last one, and cells along the states."""
 
 # Columns: v, r v', r^2 v'' at -1, then at 1; rows: powers of xi. In time v and r v' at both ends.
 IN_SPACE = np.array([
@@ -58,15 +63,38 @@ class Surface:
     axes: tuple[Array, ...]
     values: Array
     rates: Array
+    budget: Budget = field(default_factory=unlimited)
 
     @property
     def cells(self) -> tuple[int, ...]:
         """Cells along the states."""
         return tuple(len(axis) - 1 for axis in self.axes)
 
-    def patches(self, first: int, last: int) -> Patches:
-        """All patches of some slabs, time slowest."""
-        early, late = slice(first, last), slice(first + 1, last + 1)
+    def blocks(self) -> Iterator[Block]:
+        """Parts of all patches, none of which has many of them; as long as the last state has few cells, in order."""
+        slabs, per, n = len(self.times) - 1, math.prod(self.cells), len(self.cells)
+        if per <= _CHUNK:
+            stride, whole = max(1, _CHUNK // per), tuple(slice(0, count) for count in self.cells)
+            for first in range(0, slabs, stride):
+                yield first, min(first + stride, slabs), whole
+            return
+        widths, left = [1] * n, _CHUNK
+        for axis in reversed(range(n)):
+            widths[axis] = min(left, self.cells[axis])
+            left = max(1, left // widths[axis])
+        rows = [[slice(k, min(k + width, count)) for k in range(0, count, width)]
+                for width, count in zip(widths, self.cells)]  # fmt: skip
+        for first in range(slabs):
+            for cells in itertools.product(*rows):
+                yield first, first + 1, cells
+
+    def patches(self, first: int, last: int, cells: Sequence[slice]) -> Patches:
+        """All patches of some slabs and cells, time slowest."""
+        count = (last - first) * math.prod(part.stop - part.start for part in cells)
+        self.budget.fits(8 * 3 * 4 * 6 ** len(cells) * count)
+        self.budget.floats(3 * 4 * 6 ** len(cells) * count, 20)
+        inner = tuple(part for own in cells for part in (slice(own.start, own.stop + 1), slice(None)))
+        early, late = (slice(first, last), *inner), (slice(first + 1, last + 1), *inner)
         data = np.stack([self.values[early], self.rates[early], self.values[late], self.rates[late]], axis=1)
         for axis in range(len(self.axes)):
             place = 2 + 2 * axis
@@ -76,22 +104,36 @@ class Surface:
         order = [1, *(3 + 2 * i for i in range(n)), 0, *(2 + 2 * i for i in range(n))]
         flat = data.transpose(order).reshape(4, *([6] * n), -1)
         sides = [(self.times[first:last], self.times[first + 1 : last + 1])]
-        sides += [(axis[:-1], axis[1:]) for axis in self.axes]
+        sides += [(axis[part], axis[part.start + 1 : part.stop + 1]) for axis, part in zip(self.axes, cells)]
         low = np.meshgrid(*(side[0] for side in sides), indexing="ij")
         high = np.meshgrid(*(side[1] for side in sides), indexing="ij")
         return Patches(np.stack([a.ravel() for a in low]), np.stack([a.ravel() for a in high]), flat)
 
+    def chosen(self, index: int, places: Sequence[Index]) -> Patches:
+        """Some cells at the end of a slab, by their numbers along every state, as if V stayed the same in time."""
+        n, count, values = len(places), len(places[0]), self.values[index]
+        self.budget.fits(8 * 3 * 4 * 6**n * count)
+        self.budget.floats(2 * 4 * 6**n * count, 20)
+        data = np.zeros((4, *([6] * n), count))
+        for corner in itertools.product((0, 1), repeat=n):
+            nodes = tuple(part for place, k in zip(places, corner) for part in (place + k, slice(None)))
+            data[(slice(0, 4, 2), *(slice(3 * k, 3 * k + 3) for k in corner))] = np.moveaxis(values[nodes], 0, -1)
+        low = [np.zeros(count), *(axis[place] for axis, place in zip(self.axes, places))]
+        high = [np.ones(count), *(axis[place + 1] for axis, place in zip(self.axes, places))]
+        return Patches(np.stack(low), np.stack(high), data)
 
     def across(self, axis: int, node: int) -> Surface:
         """V where a state is at one of its nodes, as a function of time and of the other states."""
         cut = (slice(None),) * (1 + 2 * axis) + (node, 0)
         values, rates = self.values[cut], self.rates[cut]
-        return Surface(self.times, tuple(row for k, row in enumerate(self.axes) if k != axis), values, rates)
+        others = tuple(row for k, row in enumerate(self.axes) if k != axis)
+        return Surface(self.times, others, values, rates, self.budget)
 
     def frozen(self, index: int) -> Surface:
         """V at the end of a slab as a function that stays the same in time."""
         same = self.values[[index, index]]
-        return Surface(np.array([0.0, 1.0]), self.axes, same, np.zeros_like(same))
+        self.budget.fits(8 * 2 * same.size)
+        return Surface(np.array([0.0, 1.0]), self.axes, same, np.zeros_like(same), self.budget)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +171,9 @@ class Patches:
 
     def derivative(self, which: Terms, orders: tuple[int, ...]) -> Batch:
         """d^orders V, time first, as Taylor models; terms beyond the degree lie in the error."""
+        boxes = self.low.shape[1]
+        which.budget.fits(8 * (3 * self.data.size + 2 * which.numbers(boxes)))
+        which.budget.floats(16 * self.data.size + 2 * which.numbers(boxes), 60 + self.data.size // max(1, boxes))
         half = (self.high - self.low) / 2
         total, size = self._scaled(half)
         for axis, order in enumerate(orders):

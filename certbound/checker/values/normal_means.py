@@ -41,6 +41,8 @@ _FAR = 1e-30
 _TINY_BALL = arb(0, 1e-33)  # Q, and He_a phi for a < 8, beyond 15
 _UNIT = 2.0**-52
 _UP = 1 + 2.0**-30
+_FAR_PAIR, _NEAR_ENTRY = 30_000, 4_000
+"""Units of work of a point and an edge, and of every integral of a cell that lies near: 10 to 20 and 1 to 2 us."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +69,20 @@ class AxisTable:
 def axis_table(points: Array, edges: Array, deviation: arb, degree: int, budget: Budget) -> AxisTable:
     """The integrals of one axis for every point of the mesh and every cell, from balls."""
     shape = (len(points), len(edges) + 1)
+    pairs = math.prod(shape)
+    budget.take(8 * pairs * (ORDER * (degree + 1) + 1))
+    budget.fits(8 * pairs * (2 * ORDER + degree + 1))
+    budget.balls(pairs, _FAR_PAIR)
     integrals, off = np.zeros((ORDER, degree + 1, *shape)), np.zeros((ORDER, *shape))
     weight = np.zeros(shape)
     exact, inverse = [arb(edge) for edge in edges], 1 / deviation
     for j, point in enumerate(points):
-        budget.check()
         row = [_at((edge - arb(float(point))) * inverse) for edge in exact]
         row = [_Edge(None, arb(0), arb(0), []), *row, _Edge(None, arb(0), arb(0), [])]
         for k, (left, right) in enumerate(pairwise(row)):
             weight[j, k] = above(_mass(left, right, wide=True)) + _FAR
             if _is_near(left, right):
+                budget.balls(ORDER * (degree + 1), _NEAR_ENTRY)
                 found = _integrals(left, right, degree)
                 for a, line in enumerate(found):
                     for i, ball in enumerate(line):
@@ -86,8 +92,8 @@ def axis_table(points: Array, edges: Array, deviation: arb, degree: int, budget:
                             wrong += above(abs(ball - number))
                         if wrong > off[a, j, k]:
                             off[a, j, k] = wrong
-    size = (np.abs(integrals) / weight).max(axis=(1, 2, 3)) * _UP
-    return AxisTable(points, integrals, size, (off / weight).max(axis=(1, 2)) * _UP, weight)
+    size = np.array([(np.abs(part) / weight).max() for part in integrals]) * _UP
+    return AxisTable(points, integrals, size, np.array([(part / weight).max() for part in off]) * _UP, weight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,14 +183,27 @@ class MeanTable:
 def mean_table(axes: list[AxisTable], pieces: Array, budget: Budget) -> MeanTable:
     """The table of one function: ``pieces`` are its coefficients, shape (degree + 1, ..., cells + 2, ...) by axes."""
     n = len(axes)
+    _count(axes, pieces, budget)
     sizes = np.abs(pieces).sum(axis=tuple(range(n)))
     dominant = sizes
     for axis, table in enumerate(axes):
         dominant = _along(table.weight, dominant, axis)
-    budget.check()
     derivatives = _in_space(axes, pieces, budget)
     most = float(sizes.max())
     return MeanTable(derivatives, np.asarray(dominant * _UP), _rounding(axes, pieces), 4 * _FAR * n * most * ORDER**n)
+
+
+def _count(axes: list[AxisTable], pieces: Array, budget: Budget) -> None:
+    """Count the sums of a table, one axis after the other as `_in_space` takes them, and the arrays between."""
+    n, points, cells, largest, total = len(axes), 1, math.prod(pieces.shape[len(axes) :]), pieces.size, 0
+    powers = pieces.size // cells
+    for done, axis in enumerate(reversed(axes)):
+        inner = pieces.shape[2 * n - 1 - done]
+        total += math.comb(ORDER + done, done + 1) * powers * cells * len(axis.points) * points
+        points, cells, powers = points * len(axis.points), cells // inner, powers // pieces.shape[0]
+        largest = max(largest, powers * cells * points)
+    budget.fits(8 * (3 * largest + 2 * pieces.size + math.comb(ORDER - 1 + n, n) * points))
+    budget.floats(total // 2 + 4 * pieces.size, ORDER**n * pieces.shape[0])
 
 
 def _on_line(table: AxisTable, pieces: Array) -> dict[tuple[int, ...], Array]:

@@ -21,9 +21,10 @@ a closer look is worth its time.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -32,7 +33,7 @@ from flint import arb
 
 from certbound.checker.balls import tail
 from certbound.checker.reading import Record, numbers, unpacked
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import FUNCTION, Budget, Unproved
 from certbound.checker.statement import Model, SafeSet
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
@@ -54,6 +55,7 @@ _CUT = {1: ((8, 2),), 2: ((8, 2), (12, 2))}
 _LEAST = 2.0**-20  # V is at least so far below 0 where paths end that have not left, so that exp(V) is not 1
 _ENTRIES = 4_000_000
 _CHUNK = 4096
+"""Parts of cells that are looked at together."""
 
 
 class Passage:
@@ -108,12 +110,12 @@ class Passage:
                 raise CertificateError(f"`proof.{name}` must be two or more numbers that rise.")
         if times[0] != self._first() or times[-1] != self._last():
             raise Unproved("the slabs of time do not cover the horizon")
-        if (len(times) - 1) * np.prod([len(axis) - 1 for axis in axes]) > MOST_PATCHES:
+        if (len(times) - 1) * math.prod(len(axis) - 1 for axis in axes) > MOST_PATCHES:
             raise CertificateError(f"`proof.axes` and `proof.times` must make at most {MOST_PATCHES} patches.")
         shape = (len(times), *(size for axis in axes for size in (len(axis), 3)))
-        found = (unpacked(record[name], record.at(name), math.prod(shape)) for name in ("values", "rates"))
-        values, rates = (np.array(part).reshape(shape) for part in found)
-        return Surface(times, tuple(axes), values, rates)
+        found = (unpacked(record[name], record.at(name), math.prod(shape), self.budget) for name in ("values", "rates"))
+        values, rates = (np.frombuffer(part).reshape(shape) for part in found)
+        return Surface(times, tuple(axes), values, rates, self.budget)
 
     def upper(self) -> arb:
         """At least the probability of leaving."""
@@ -190,9 +192,9 @@ class Passage:
     def across(self, axis: int, node: int) -> tuple[Array, Array]:
         """Ends of V, before it is lifted, where a state is at a node: over all patches, time slowest."""
         n, face = self.model.dimension, self.surface.across(axis, node)
-        which, found = terms(n, 3 + 5 * (n - 1)), []
-        for first, last in self._chunks(face):
-            found.append(face.patches(first, last).derivative(which, (0,) * n).sharp_ends())
+        which, found = terms(n, 3 + 5 * (n - 1), self.budget), []
+        for block in face.blocks():
+            found.append(face.patches(*block).derivative(which, (0,) * n).sharp_ends())
         low, high = (np.concatenate(parts) for parts in zip(*found))
         return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
 
@@ -204,14 +206,16 @@ class Passage:
 
     def _over(self, low: Sequence[float], high: Sequence[float]) -> tuple[Array, Array]:
         """Ends of V(0, .) on the parts of a box that meet the patches, before V is lifted."""
-        n = self.model.dimension
-        patches = self.surface.frozen(0).patches(0, 1)
-        met = np.ones(patches.low.shape[1], dtype=bool)
-        for i in range(n):
-            met &= (patches.low[1 + i] <= high[i]) & (patches.high[1 + i] >= low[i])
-        found = patches.take(np.flatnonzero(met))
-        rows = [np.full(found.low.shape[1], value) for value in (*low, *high)]
-        return self._parts(found, rows[:n], rows[n:])
+        n, ends = self.model.dimension, []
+        met = [np.flatnonzero((axis[:-1] <= b) & (axis[1:] >= a)) for axis, a, b in zip(self.surface.axes, low, high)]
+        if not all(map(len, met)):
+            raise Unproved("a start was not shown to lie in the grid")
+        places = [part.ravel() for part in np.meshgrid(*met, indexing="ij")]
+        for first in range(0, len(places[0]), _CHUNK):
+            found = self.surface.chosen(0, [part[first : first + _CHUNK] for part in places])
+            rows = [np.full(found.low.shape[1], value) for value in (*low, *high)]
+            ends.append(self._parts(found, rows[:n], rows[n:]))
+        return np.concatenate([end[0] for end in ends]), np.concatenate([end[1] for end in ends])
 
     def _parts(self, patches: Patches, low: Sequence[Array], high: Sequence[Array]) -> tuple[Array, Array]:
         """Ends of V on the part of every patch of a frozen surface that lies between ``low`` and ``high``."""
@@ -220,13 +224,13 @@ class Passage:
     def part_of(self, patches: Patches, low: Sequence[Array], high: Sequence[Array]) -> Batch:
         """V on these parts, before it is lifted."""
         n = self.model.dimension
-        whole = patches.derivative(terms(n + 1, 5 * n), (0,) * (n + 1))
+        whole = patches.derivative(terms(n + 1, 5 * n, self.budget), (0,) * (n + 1))
         parts = [self._part(patches, i, low[i], high[i], whole.terms) for i in range(n)]
         return _substituted(whole, parts)
 
     def _law(self) -> tuple[Array, Array, Array]:
         """Edges of the parts of the cells of one state, and ends of V(0, .) on each, V being lifted."""
-        patches = self.surface.frozen(0).patches(0, 1)
+        patches = self.surface.chosen(0, [np.arange(self.surface.cells[0])])
         a, b = patches.low[1], patches.high[1]
         rows = np.stack([a, *(a + (b - a) * (k / self.pieces) for k in range(1, self.pieces)), b])
         if not (np.diff(rows, axis=0) > 0).all():
@@ -247,6 +251,7 @@ class Passage:
         assert covariance is not None
         (spread,) = independent(covariance, "the start")
         edges, low, high = self._law()
+        self.budget.balls(len(edges), 3 * FUNCTION)
         scale = spread * arb(2).sqrt()
         tails = [((arb(float(x)) - centre) / scale).erfc() / 2 for x in edges]
         total, far = arb(0), _FAR * float(spread.mid())
@@ -261,10 +266,16 @@ class Passage:
 
     def _at_end(self) -> float:
         """At most V at the horizon."""
-        n = self.model.dimension
-        patches = self.surface.frozen(-1).patches(0, 1)
-        low = patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
-        return float(np.nextafter(low.min() + self.lift, -np.inf))
+        return float(np.nextafter(self.last_ends()[0].min() + self.lift, -np.inf))
+
+    def last_ends(self) -> tuple[Array, Array]:
+        """Ends of V, before it is lifted, on all cells at the end, in their shape."""
+        n, last = self.model.dimension, self.surface.frozen(-1)
+        which, low, high = terms(n + 1, 5 + 3 * (n - 1), self.budget), np.empty(last.cells), np.empty(last.cells)
+        for first, end, cells in last.blocks():
+            found = last.patches(first, end, cells).derivative(which, (0,) * (n + 1)).sharp_ends()
+            low[cells], high[cells] = (part.reshape(low[cells].shape) for part in found)
+        return low, high
 
     def _where_spared(self) -> float:
         """At most V on the sides by which a path ends that does not fail, in whatever stage it does."""
@@ -278,21 +289,16 @@ class Passage:
         middle = tm.fixed(which, a / 2 + b / 2, (np.abs(a) + np.abs(b)) * 2.0**-51)
         return tm.scaled(tm.sub(x, middle), 2 / (b - a), 4 / (b - a) * 2.0**-52)
 
-    def _chunks(self, surface: Surface) -> list[tuple[int, int]]:
-        count = len(surface.times) - 1
-        stride = max(1, _CHUNK // max(1, int(np.prod(surface.cells))))
-        return [(first, min(first + stride, count)) for first in range(0, count, stride)]
-
     # ---- the residual ----------------------------------------------------------------------------------------
 
     def _payments(self, start: float) -> Array:
         """lam of every slab: what its patches need, which the file says about."""
-        lam, per = np.zeros(len(self.eps)), int(np.prod(self.surface.cells))
-        for first, last in self._chunks(self.surface):
-            patches = self.surface.patches(first, last)
-            slab = first + np.arange(patches.low.shape[1]) // per
+        lam = np.zeros(len(self.eps))
+        for first, last, cells in self.surface.blocks():
+            patches = self.surface.patches(first, last, cells)
+            slab = first + np.arange(patches.low.shape[1]) * (last - first) // patches.low.shape[1]
             if self.due is not None:  # nothing is asked where paths are over
-                here = np.flatnonzero(np.tile(self.due.ravel(), last - first))
+                here = np.flatnonzero(np.tile(self.due[cells].ravel(), last - first))
                 patches, slab = patches.take(here), slab[here]
             for degree, parts in (looks := [*((degree, 1) for degree in self.degrees), *_CUT[self.model.dimension]]):
                 needs = [self._needs(part, slab, start, degree) for part in patches.cut(parts)]
@@ -307,7 +313,7 @@ class Passage:
 
     def _needs(self, patches: Patches, slab: Index, start: float, degree: int) -> Array:
         """What every patch needs as lam, from Taylor models of some degree."""
-        which = terms(self._variables(), degree)
+        which = terms(self._variables(), degree, self.budget)
         need, size = np.zeros(len(slab)), max(32, _ENTRIES // (degree + 1) ** which.variables)
         for first in range(0, len(slab), size):
             self.budget.check()
@@ -326,6 +332,7 @@ class Passage:
         if len(due):
             low, high = low[due], high[due]
             excess = self._residual(patches.take(due), self.levels.least(low, high), which).sharp_ends()[1]
+            self.budget.balls(len(due), FUNCTION)
             reach = np.array([below(arb(x).exp()) for x in np.minimum(start - high, 600.0)])
             found = (excess - eps[due] * reach * (1 - 1e-12)) * (1 + 1e-12)
             need[due] = np.where(np.isfinite(excess), np.maximum(found, 0.0), np.inf)
@@ -364,13 +371,14 @@ class Passage:
     def _squares(self, inputs: Sequence[Batch]) -> list[list[Batch]]:
         """g g^T."""
         given, n = self.model.noise.diffusion, self.model.dimension
+        columns = given.shape[1] if isinstance(given, Tape) else given.ncols()
+        self.budget.fits(8 * (n * columns + 2 * n * n) * inputs[0].coefficients.size)
         if isinstance(given, Tape):
-            entries, columns = run(given, inputs), given.shape[1]
+            entries = run(given, inputs)
         else:
-            columns = given.ncols()
             entries = [tm.fixed(inputs[0].terms, np.full(inputs[0].error.shape, float(x))) for x in given.entries()]
         rows = [entries[i * columns : (i + 1) * columns] for i in range(n)]
-        return [[_summed([tm.mul(x, y) for x, y in zip(one, two)]) for two in rows] for one in rows]
+        return [[_summed(tm.mul(x, y) for x, y in zip(one, two)) for two in rows] for one in rows]
 
 
 def _order(n: int, *states: int) -> tuple[int, ...]:
@@ -378,11 +386,8 @@ def _order(n: int, *states: int) -> tuple[int, ...]:
     return (0, *(states.count(i) for i in range(n)))
 
 
-def _summed(parts: list[Batch]) -> Batch:
-    total = parts[0]
-    for part in parts[1:]:
-        total = tm.add(total, part)
-    return total
+def _summed(parts: Iterator[Batch]) -> Batch:
+    return functools.reduce(tm.add, parts)
 
 
 def _substituted(x: Batch, parts: Sequence[Batch]) -> Batch:

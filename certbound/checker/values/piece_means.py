@@ -8,12 +8,13 @@ whatever the noise does with the state. From below with smallest values and leas
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from flint import arb
 
-from certbound.checker.report import Unproved
+from certbound.checker.report import FUNCTION, Unproved
 from certbound.checker.statement import Model
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Array, Batch, Index, above, below, terms
@@ -22,6 +23,8 @@ from certbound.checker.values.step_back import DEGREE, Grid, Steps, Transition, 
 _MOST_STATES = 2
 _MOST_PIECES = 200_000
 _HELD = 20_000_000  # places that are kept for the next step
+_BOX_BYTES, _BOX_WORK = 100, 2_000
+"""Memory and units of work of a side of a box of noise while the arrays are made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +45,19 @@ def pieces_of(model: Model, count: int) -> Pieces:
         raise Unproved(f"noise in pieces is for at most {_MOST_STATES} states")
     if noise.cut is None or not noise.entries:
         raise Unproved("value functions are proved for noise only with independent entries of a law that is known")
+    model.budget.balls(count + len(noise.entries), 3 * FUNCTION)
     unit = noise.cut(count)
     inside = sum((share for _, _, share in unit), arb(0))
     still = [(arb(0), arb(0), arb(1))]
     axes = [[(a * size, b * size, share) for a, b, share in unit] if size > 0 else still for size in noise.entries]
     if not all(size > 0 or size.is_zero() for size in noise.entries):
         raise Unproved("a size of the noise was not decided")
-    if np.prod([len(axis) for axis in axes]) > _MOST_PIECES:
+    many = math.prod(map(len, axes))
+    if many > _MOST_PIECES:
         raise Unproved(f"the noise would have more than {_MOST_PIECES} pieces")
+    model.budget.take(16 * many * len(axes))
+    model.budget.fits(_BOX_BYTES * many * len(axes))
+    model.budget.balls(many * (1 + len(axes)), _BOX_WORK)
     boxes = list(itertools.product(*axes))
     shares = []
     for box in boxes:
@@ -97,21 +105,28 @@ class _Extremes:
         return np.asarray(self.pick.reduce(found))
 
 
+def _table_size(shape: tuple[int, ...]) -> int:
+    """Numbers of the `_Extremes` of a table over so many cells."""
+    return math.prod((size + 2) * (size + 2).bit_length() for size in shape)
+
+
 class PieceTransition(Transition):
     """One step from some boxes into a grid, by the pieces of the noise."""
 
     def __init__(self, steps: Steps, step: int, low: Array, high: Array, after: Grid, pieces: Pieces) -> None:
         self.steps, self.n, self.after, self.pieces = steps, len(low), after, pieces
         self.count = low.shape[1]
+        steps.budget.take(8 * len(steps.disturbances) * (2 * self.n + 1) * self.count)
         self.ends = []
         for images in steps.images(step, low, high):
             self.ends.append(tuple(np.array(side) for side in zip(*(image.sharp_ends() for image in images))))
-        gains = [gain.sharp_ends() for gain in steps.gains(step, low, high)]
-        self.gains = tuple(np.array(side).reshape(self.n, -1, self.count) for side in zip(*gains))
+        self.gains = tuple(side.reshape(self.n, -1, self.count) for side in steps.gains(step, low, high))
         undefined = ~np.isfinite(self.gains).all(axis=(0, 1, 2))
         self.lost = [undefined | ~np.isfinite(ends).all(axis=(0, 1)) for ends in self.ends]
         self._places: dict[tuple[int, int], tuple[Index, Index]] = {}
-        self._keeps = 4 * self.count * len(pieces.most) * len(self.ends) <= _HELD
+        places = 4 * self.count * len(pieces.most) * len(self.ends)
+        self._keeps = places <= _HELD
+        steps.budget.take(8 * places if self._keeps else 0)
 
     def apply(self, value: Values) -> Batch:
         """A bound of sup over d of E U(f + w) on every box."""
@@ -121,6 +136,8 @@ class PieceTransition(Transition):
         cells = np.minimum(middle + size + slack, 1.0) if upper else np.maximum(middle - size - slack, 0.0)
         shape = (*value.grid.shape, 1)[:2]
         ring = [(1, 1)] * self.n + [(0, 0)] * (2 - self.n)
+        self.steps.budget.fits(8 * _table_size(shape))
+        self.steps.budget.floats(_table_size(shape))
         table = np.pad(np.maximum(cells, 0.0).reshape(shape), ring, constant_values=value.beyond)
         extremes = _Extremes.of(table, np.maximum if upper else np.minimum)
         found = [self._mean(extremes, part) for part in range(len(self.ends))]
@@ -134,9 +151,13 @@ class PieceTransition(Transition):
     def _mean(self, extremes: _Extremes, part: int) -> Array:
         upper = self.steps.upper
         total = np.zeros(self.count)
+        gains = self.gains[0].size if self._keeps else 2 * self.gains[0].size
+        work = 12 * gains + 200 * self.count
+        self.steps.budget.expect(len(self.pieces.most) * work)
+        self.steps.budget.fits(8 * 8 * gains)
         for k, weight in enumerate(self.pieces.most if upper else self.pieces.least):
             if weight > 0:
-                self.steps.budget.check()
+                self.steps.budget.floats(work, 40)
                 total += weight * extremes.over(*self._met(part, k))
         return np.where(self.lost[part], 1.0 if upper else 0.0, total)
 

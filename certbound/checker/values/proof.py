@@ -45,6 +45,9 @@ MOST_STATES = 3
 MOST_CELLS = 100_000
 MOST_PARTS = 4096
 MOST_STEPS = 2_000
+_MOST_ZONES = 8
+_PER_OPERATION = 3_000
+"""Units of work of an operation of a tape on a batch, at least."""
 _LOST = 1e-3  # of the largest probability of being safe: cells with less count as failed
 
 
@@ -116,6 +119,7 @@ class _Discrete:
         self.pieces = None if record["pieces"] is None else pieces_of(model, record.whole("pieces", 2, 20_000))
         self._zones: dict[tuple[int, int], Zones] = {}
         self._kept: tuple[tuple[int, int, int], Transition] | None = None
+        self._held = 0  # bytes that it takes
 
     def _last(self, record: Record) -> int:
         """The last step that is looked at."""
@@ -150,6 +154,9 @@ class _Discrete:
             first = StepSet(replace(self.model, constraints=limits), 0, self.budget)
             if not all(first.holds(box, strictly=True) for box in self.starts):
                 raise Unproved("the initial set was not shown to lie in the safe set")
+        if not self.steps.steady:
+            parts = len(self.steps.disturbances)
+            self.budget.expect((self.last - self.first) * parts * len(self.model.dynamics.nodes) * _PER_OPERATION)
         stays, value, arrived = self.model.stays, None, None
         for t in range(self.last, self.first - 1, -1):
             if stays and t >= self.window[0]:
@@ -209,7 +216,9 @@ class _Discrete:
         return Values(self._grid(t), found, self.beyond)
 
     def _constant(self, t: int, level: float) -> Array:
-        found = np.zeros((len(terms(self.model.dimension, DEGREE).exponents), len(self._zone(t).safe)))
+        which, cells = terms(self.model.dimension, DEGREE, self.budget), len(self._zone(t).safe)
+        self.budget.floats(4 * which.numbers(cells), 40)
+        found = np.zeros((len(which.exponents), cells))
         found[0] = level
         return found
 
@@ -218,7 +227,11 @@ class _Discrete:
         key = (self.order[t], self.order[t + 1], 0 if self.steps.steady else t)
         if self._kept is None or self._kept[0] != key:
             low, high = self._grid(t).boxes()
+            self._kept = None
+            self.budget.give(self._held)
+            before = self.budget.memory
             self._kept = key, self._transition(t, low, high, self._grid(t + 1))
+            self._held = before - self.budget.memory
         return bounded(self._kept[1].apply(after), upper=self.above)
 
     def _over_starts(self, value: Values, arrived: Values | None) -> float:
@@ -283,6 +296,7 @@ class _Discrete:
             axis_table(one, edges, spread, DEGREE, self.budget)
             for one, edges, spread in zip(points, value.grid.edges, spreads)
         ]
+        self.budget.fits(8 * 2 * value.size)
         table = mean_table(axes, value.pieces(), self.budget)
         mean = float(table.derivatives[(0,) * len(axes)].item())
         wrong = float(table.dominant.item() * table.missing(np.zeros(1)).item() + table.far) * (1 + 1e-9)
@@ -300,6 +314,8 @@ class _Discrete:
         still = all(c.during is None and isinstance(c.region.center, list) for c in asked)
         key = (self.order[step], 0 if still else step)
         if key not in self._zones:
+            if len(self._zones) >= _MOST_ZONES:
+                self._zones.clear()
             self._zones[key] = zones(
                 self._grid(step), self.model, step, self.budget, strictly=self.pieces is not None
             )
@@ -322,6 +338,6 @@ def _grid(value: object, path: str, model: Model) -> Grid:
     rows = [numbers(item, path, None) for item in entries(value, path, model.dimension, model.dimension)]
     if any(len(row) < 2 or any(not a < b for a, b in pairwise(row)) for row in rows):
         raise CertificateError(f"`{path}` must hold two or more rising numbers for every state.")
-    if np.prod([len(row) - 1 for row in rows]) > MOST_CELLS:
+    if math.prod(len(row) - 1 for row in rows) > MOST_CELLS:
         raise CertificateError(f"`{path}` must make at most {MOST_CELLS} cells.")
     return Grid(tuple(np.array(row) for row in rows))

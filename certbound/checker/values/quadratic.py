@@ -27,7 +27,7 @@ from flint import arb, arb_mat
 
 from certbound.checker.balls import identity, is_positive_definite, largest_eigenvalue, matrix, upper
 from certbound.checker.reading import Record, entries, numbers, unpacked, whole, wholes
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import FUNCTION, PRODUCT, Budget, Unproved
 from certbound.checker.statement import Model
 from certbound.checker.values.second_order import Flow, Local
 from certbound.checker.values.walls import Key, Surroundings, Wall
@@ -102,10 +102,14 @@ def _at_corners(around: Surroundings, walls: Sequence[_Value]) -> arb:
     if len(wide) > _MOST_CORNERS:
         raise Unproved(f"this proof treats starts that are wide along at most {_MOST_CORNERS} states")
     half = [(high - low) / 2 for low, high in around.start]
+    budget, n = around.model.budget, around.n
+    budget.products(len(walls), n + 1, n + 1, 60 + 20 * n)
+    budget.products(len(walls) << len(wide), n + 1, n + 20)
+    budget.balls(len(walls) << len(wide), FUNCTION)
     lifts = []
     for wall in walls:
         bend = [[-half[i] * half[j] * wall.matrices[0][i, j] for j in wide] for i in wide]
-        lifts.append(largest_eigenvalue(matrix(bend)) * len(wide) / 2 if wide else arb(0))
+        lifts.append(largest_eigenvalue(matrix(bend), budget) * len(wide) / 2 if wide else arb(0))
     worst = arb(0)
     for ends in itertools.product((0, 1), repeat=len(wide)):
         z = [low.union(high) for low, high in around.start]
@@ -124,7 +128,10 @@ def _over_ball(around: Surroundings, wall: _Value) -> arb:
     here = wall.matrices[0]
     slope = (here * arb_mat(n + 1, 1, [*z, arb(1)])).entries()[:n]
     rise = sum(((r * x).abs_upper() ** 2 for r, x in zip(radius, slope)), arb(0)).sqrt()
-    bend = largest_eigenvalue(matrix([[radius[i] * radius[j] * here[i, j] for j in range(n)] for i in range(n)]))
+    budget = around.model.budget
+    bend = largest_eigenvalue(
+        matrix([[radius[i] * radius[j] * here[i, j] for j in range(n)] for i in range(n)]), budget
+    )
     return (wall.paid + wall.at(z) + rise + bend / 2).exp()
 
 
@@ -170,16 +177,22 @@ class _Value:
                 raise CertificateError(f"`{path}` must rise from -1 to 1.")
             rows[a] = [arb(x) for x in edges]
             count *= len(edges) - 1
+        many = count
         self.corners = len(self.held) + self.flow.q - self.n
         count *= (self.degree + 1) * (len(self.times) - 1)
         if self.corners > 20 or count << self.corners > MOST_MATRICES:
             raise CertificateError(f"`{path}` must make at most {MOST_MATRICES} matrices.")
+        self.budget.take(many * (200 + 16 * self.n))
+        self.budget.spend(many * (1_000 + 50 * self.n))
         boxes = itertools.product(*(list(pairwise(row)) for row in rows))
         return [([a for a, _ in box], [b for _, b in box]) for box in boxes]
 
     def _read(self) -> None:
         record, n = self.record, self.n
         pieces, cells, ends = len(self.times) - 1, len(self.cells), self.degree + 1
+        many = len(self.held) * (n + 1) * (n + 2)
+        self.budget.take(150 * many)
+        self.budget.spend(3_000 * many)
         self.splits = splitting(n, self.held)
         self.matrices = []
         for k, rows in enumerate(record.array("matrices", self.degree * pieces + 1, n + 1, n + 1)):
@@ -191,7 +204,9 @@ class _Value:
                   "weights": (pieces, ends, 1 << self.corners, cells, forms)}  # fmt: skip
         if any(math.prod(shape) > MOST_NUMBERS for shape in shapes.values()):
             raise CertificateError(f"`{record.path}` must hold at most {MOST_NUMBERS} multipliers.")
-        found = (unpacked(record[name], record.at(name), math.prod(shape)) for name, shape in shapes.items())
+        found = (
+            unpacked(record[name], record.at(name), math.prod(shape), self.budget) for name, shape in shapes.items()
+        )
         self.moves, self.weights = (np.array(part).reshape(shape) for part, shape in zip(found, shapes.values()))
         self.wall_weights, self.wall_rows = (self._on_walls(name, forms) for name in ("wall_weights", "wall_rows"))
         if not ((self.weights >= 0).all() and all(mu >= 0 for rows in self.wall_weights for row in rows for mu in row)):
@@ -230,12 +245,17 @@ class _Value:
             self._on_wall(*given)
         around = self.around
         gains = self.flow.gain(around.center, around.width)
+        n, many = self.n + 1, 2 + len(self.held) + self.flow.q - self.n
+        points = len(self.cells) * (self.degree + 1) * (len(self.times) - 1) << self.corners
+        self.budget.expect(points * n * n * 4 * (self.flow.columns + n) * PRODUCT)
+        self.budget.hold(len(self.cells) * many * n * n)
         locals_ = [self.flow.over(low, high, self.held, around.center, around.width) for low, high in self.cells]
         steps = [b - a for a, b in pairwise(self.times)]
         for k, (side, (a, b, factor)) in itertools.product(range(len(steps)), enumerate(_SLOPES[self.degree])):
             at = self.degree * k
             slope = (self.matrices[at + b] - self.matrices[at + a]) * (factor / steps[k])
             here = self.matrices[at + side]
+            self.budget.products(2 * len(gains) + 4, n, n, n + 20)
             trace = sum((g.transpose() * here * g for g in gains), slope)
             for c, local in enumerate(locals_):
                 self._on_cell((k, side, c), trace, local, gains)
@@ -243,6 +263,8 @@ class _Value:
     def _on_cell(self, place: Place, known: arb_mat, local: Local, gains: Sequence[arb_mat]) -> None:
         """M + lam/|z|^2 at all corners of a cell; ``known`` is the part of -2 M that is the same everywhere."""
         k, side, c = place
+        n, forms = self.n + 1, self.n + len(self.around.inside)
+        self.budget.balls(4 * len(self.splits) + 4 * n * n * (1 + len(self.held)))
         low, high = self.cells[c]
         here = self.matrices[self.degree * k + side]
         reach = sum((arb.max(a * a, b * b) for a, b in zip(low, high)), arb(1))
@@ -251,7 +273,8 @@ class _Value:
         extra = [(sum(row, arb(0)) / _STEEP).sqrt() for row in local.rest]
         splits = self._splits(self.moves[k, side, c])
         for number, bits in enumerate(itertools.product((0, 1), repeat=self.corners)):
-            self.budget.check()
+            self.budget.products(n, n, 4 * (len(gains) + n) + forms + 6 * self.corners + 60)
+            self.budget.balls(n * (len(gains) + 3 * n + 6))
             ends = [high[a] if bit else low[a] for a, bit in zip(self.held, bits)]
             drift = self._drift(local, ends, bits)
             total = here * drift
@@ -260,7 +283,7 @@ class _Value:
             border = here * spread
             total = (total + border * border.transpose()) * arb(0.5)
             total = total + sum((part * end for part, end in zip(splits, ends)), self._sides(place, number) + missing)
-            if not is_positive_definite(shift - total):
+            if not is_positive_definite(shift - total, self.budget):
                 raise Unproved("the growth of a quadratic bound was not shown to be as small as stated")
 
     def _drift(self, local: Local, ends: Sequence[arb], bits: Sequence[int]) -> arb_mat:
@@ -318,6 +341,7 @@ class _Value:
         room = identity(n + 1) * (self.gap / (n + 1))
         matrices = self.matrices[self.degree * self.first :]
         for here, weights, row in zip(matrices, wall_weights, wall_rows, strict=True):
+            self.budget.products(n + 1, n + 1, 2 * forms + 3 * len(wall.forms) + 60)
             total = here * arb(0.5) + room - self._weighed(weights[:forms], low, high)
             for form, mu in zip(wall.forms, weights[forms:], strict=True):
                 total = total - form * arb(float(mu))

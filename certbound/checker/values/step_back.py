@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -43,6 +43,8 @@ Side = tuple[arb, arb]
 
 DEGREE = 4
 _CHUNK = 4096
+_BOX_BYTES = 400
+"""Memory of a side of a cell, in balls."""
 _MOST_POINTS = 400_000
 _MOST_ENTRIES = 1_000_000
 """Of the integrals of one axis, which are held 40 times over."""
@@ -74,6 +76,12 @@ class Values:
     coefficients: Array
     beyond: float
 
+    @property
+    def size(self) -> int:
+        """Numbers in its `pieces`."""
+        powers: int = (DEGREE + 1) ** len(self.grid.edges)
+        return powers * math.prod(count + 2 for count in self.grid.shape)
+
     def pieces(self) -> Array:
         """Coefficients by exponents and cells, with the outer cells, shape (degree + 1, ..., cells + 2, ...)."""
         n = len(self.grid.edges)
@@ -90,31 +98,47 @@ class Steps:
 
     def __init__(self, model: Model, parts: int, budget: Budget, *, upper: bool) -> None:
         self.model, self.budget, self.upper = model, budget, upper
-        self.terms = terms(model.dimension + len(model.disturbance), DEGREE)
+        self.terms = terms(model.dimension + len(model.disturbance), DEGREE, budget)
+        many = parts ** len(model.disturbance) if upper else 2 ** len(model.disturbance)
+        budget.take(100 * (1 + len(model.disturbance)) * many)
+        budget.spend(1_000 * (1 + len(model.disturbance)) * many)
         self.disturbances = _parts(model.disturbance, parts, upper)
         tapes = [model.dynamics, *([g] if isinstance(g := model.noise.diffusion, Tape) else [])]
         clock = any(node.op == "input" and node.args[0] == 0 for tape in tapes for node in tape.nodes)
         rows = model.plan
         self.steady = not clock and (rows is None or all(row == rows[0] for row in rows))
 
-    def images(self, step: int, low: Array, high: Array) -> list[list[Batch]]:
-        """f over some boxes, shape (states, boxes), per part of the disturbances and state."""
-        found = []
-        for part in self.disturbances:
-            chunks = []
-            for start in range(0, low.shape[1], _CHUNK):
-                self.budget.check()
-                chunks.append(self._image(step, low[:, start : start + _CHUNK], high[:, start : start + _CHUNK], part))
-            found.append([tm.joined([chunk[i] for chunk in chunks]) for i in range(len(low))])
-        return found
-
-    def gains(self, step: int, low: Array, high: Array) -> list[Batch]:
-        """What multiplies the noise over some boxes, row by row."""
-        given = self.model.noise.diffusion
-        if isinstance(given, Tape):
-            return run(given, self._states(step, low, high))
+    def images(self, step: int, low: Array, high: Array) -> Iterator[list[Batch]]:
+        """f over some boxes, shape (states, boxes), one part of the disturbances after the other, by states."""
         count = low.shape[1]
-        return [tm.fixed(self.terms, np.full(count, float(x))) for x in given.entries()]
+        for part in self.disturbances:
+            self.budget.fits(8 * 2 * len(low) * self.terms.numbers(count))
+            chunks = [
+                self._image(step, low[:, start : start + _CHUNK], high[:, start : start + _CHUNK], part)
+                for start in range(0, count, _CHUNK)
+            ]
+            yield [tm.joined([chunk[i] for chunk in chunks]) for i in range(len(low))]
+
+    def all_images(self, step: int, low: Array, high: Array) -> list[list[Batch]]:
+        """The same for all parts at once, held in memory."""
+        self.budget.take(8 * len(self.disturbances) * len(low) * (self.terms.numbers(low.shape[1]) + low.shape[1]))
+        return list(self.images(step, low, high))
+
+    def gains(self, step: int, low: Array, high: Array) -> Array:
+        """Ends of what multiplies the noise over some boxes, shape (2, entries row by row, boxes)."""
+        given, count = self.model.noise.diffusion, low.shape[1]
+        entries = len(given.outputs) if isinstance(given, Tape) else given.nrows() * given.ncols()
+        self.budget.take(8 * 2 * entries * count)
+        self.budget.floats(2 * entries * count)
+        found = np.empty((2, entries, count))
+        if not isinstance(given, Tape):
+            found[:] = np.array([float(x) for x in given.entries()])[None, :, None]
+            return found
+        for start in range(0, count, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            for place, gain in enumerate(run(given, self._states(step, low[:, part], high[:, part]))):
+                found[:, place, part] = gain.sharp_ends()
+        return found
 
     def _states(self, step: int, low: Array, high: Array) -> list[Batch]:
         which, count = self.terms, low.shape[1]
@@ -151,7 +175,7 @@ def independent(covariance: arb_mat, what: str) -> list[arb]:
 
 def _parts(ranges: list[tuple[float, float]], parts: int, upper: bool) -> list[tuple[tuple[float, float], ...]]:
     """Boxes that cover the disturbances; from below their corners, any of which will do."""
-    sides = []
+    sides: list[list[tuple[float, float]]] = []
     for low, high in ranges:
         cuts = [low, *(low + (high - low) * k / parts for k in range(1, parts)), high] if low < high else [low, high]
         sides.append(list(itertools.pairwise(sorted(cuts))) if upper else [(cut, cut) for cut in sorted({low, high})])
@@ -163,14 +187,14 @@ class Transition:
 
     def __init__(self, steps: Steps, step: int, low: Array, high: Array, after: Grid) -> None:
         self.steps, self.n = steps, len(low)
-        self.images = steps.images(step, low, high)
+        self.images = steps.all_images(step, low, high)
         spreads = _deviations(steps.model)
         self._scales = [(float((1 / s).mid()), above(abs(1 / s - float((1 / s).mid())))) for s in spreads]
         self._spacing = [float(s.mid()) / PER_DEVIATION for s in spreads]
         if not all(width > 0 and math.isfinite(scale) for width, (scale, _) in zip(self._spacing, self._scales)):
             raise Unproved("the noise is too small for value functions in floats")
         points = [self._points(i, after.edges[i]) for i in range(self.n)]
-        if np.prod([len(one) for one in points]) > _MOST_POINTS:
+        if math.prod(map(len, points)) > _MOST_POINTS:
             raise Unproved(f"the mesh around the images would have more than {_MOST_POINTS} points")
         if max(len(one) * len(edges) for one, edges in zip(points, after.edges)) > _MOST_ENTRIES:
             raise Unproved(f"the mesh and the grid of one state make more than {_MOST_ENTRIES} pairs")
@@ -201,6 +225,7 @@ class Transition:
 
     def table(self, value: Values) -> Any:
         """What the mean after the noise is computed from."""
+        self.steps.budget.fits(8 * 2 * value.size)
         return mean_table(self.axes, value.pieces(), self.steps.budget)
 
     def _means(self, images: list[Batch], table: Any) -> Batch:
@@ -218,10 +243,13 @@ class Transition:
             points = self.axes[i].points
             place = np.clip(np.rint((image.value - points[0]) / self._spacing[i]), 0, len(points) - 1).astype(int)
             shift = tm.scaled(tm.sub(image, tm.fixed(which, points[place])), *self._scales[i])
+            self.steps.budget.floats(40 * len(place), 20)
             places.append(place)
             shifts.append(shift)
             square = square + (np.abs(shift.value) + shift.reach()) ** 2
         index = tuple(places)
+        self.steps.budget.fits(8 * len(table.derivatives) * len(square))
+        self.steps.budget.floats(8 * len(table.derivatives) * len(square), len(table.derivatives))
         total = self._polynomial(shifts, {a: part[index] for a, part in table.derivatives.items()})
         missing = table.missing(np.sqrt(square) * (1 + 1e-12))
         error = total.error + (table.dominant[index] * missing + table.far) * (1 + 1e-9)
@@ -253,7 +281,8 @@ def _horner(which: Terms, x: Batch, factors: list[Array]) -> Batch:
 
 def _without(x: Batch, n: int, *, upper: bool) -> Batch:
     """The bound over all disturbances of a part: a polynomial in the states alone, its error in the constant."""
-    which = terms(n, x.terms.degree)
+    which = terms(n, x.terms.degree, x.terms.budget)
+    x.terms.budget.floats(2 * x.coefficients.size, len(x.terms.exponents))
     place = {a: k for k, a in enumerate(which.exponents)}
     coefficients, error = np.zeros((len(which.exponents), len(x.error))), x.error.copy()
     for exponents, row in zip(x.terms.exponents, x.coefficients):
@@ -303,6 +332,7 @@ class Zones:
 
 def zones(grid: Grid, model: Model, step: int, budget: Budget, *, strictly: bool = False) -> Zones:
     """What is known of every cell; ``strictly``: one that touches an obstacle is not safe."""
+    budget.fits(_BOX_BYTES * len(grid.edges) * math.prod(grid.shape))
     low, high = grid.boxes()
     boxes = [[(arb(a), arb(b)) for a, b in zip(low[:, k], high[:, k])] for k in range(low.shape[1])]
     limits, domain = (model.constraints[:-1], model.constraints[-1:]) if model.ends else (model.constraints, ())
@@ -312,6 +342,7 @@ def zones(grid: Grid, model: Model, step: int, budget: Budget, *, strictly: bool
     if counts(model, step):
         target = StepSet(replace(model, constraints=(target_of(model),)), step, budget)
         done, undone = _decided(target.holds, boxes, budget), _decided(target.excludes, boxes, budget)
+    budget.expect(2 * len(boxes) * allowed.work)
     safe = _decided(partial(allowed.holds, strictly=strictly), boxes, budget)
     unsafe = _decided(allowed.excludes, boxes, budget)
     return Zones(safe, unsafe, done, undone, _decided(inside.holds, boxes, budget))

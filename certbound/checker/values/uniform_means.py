@@ -108,17 +108,21 @@ class UniformTransition(Transition):
 
     def __init__(self, steps: Steps, step: int, low: Array, high: Array, after: Grid) -> None:
         self.steps, self.n = steps, len(low)
-        self.images = steps.images(step, low, high)
+        self.images = steps.all_images(step, low, high)
         exact = halfwidth_of(steps.model)
         self.reach = float(exact.mid())
 
     def table(self, value: Values) -> _Integral:
         """What the mean is computed from."""
+        cells = len(value.grid.edges[0])
+        self.steps.budget.fits(8 * cells * (2 * cells.bit_length() + 16))
+        self.steps.budget.floats(cells * (2 * cells.bit_length() + 40), 100)
         return _integral(value)
 
     def mean(self, images: list[Batch], table: _Integral) -> Batch:
         """Taylor models of h(f)."""
         (image,) = images
+        self.steps.budget.floats(400 * len(image.error), 200)
         good = np.isfinite(image.error)
         centre = np.where(good, image.value, 0.0)
         away = np.where(good, image.reach(), 0.0)

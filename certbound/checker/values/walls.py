@@ -66,6 +66,8 @@ class Surroundings:
     def _row(self, number: int, face: int) -> list[arb]:
         """face . (x - its centre) - bound over z."""
         region = self.model.constraints[number].region
+        self.model.budget.balls(3 * (self.n + 2) ** 2)
+        self.model.budget.hold((self.n + 1) ** 2)
         normal = region.lift(region.face(face), self.n)
         assert isinstance(region.center, list)
         middle = region.lift([arb(x) for x in region.center], self.n)
@@ -110,6 +112,7 @@ class Surroundings:
         """A side of the working box, unless it lies where some form is negative."""
         row = [arb(0)] * self.n + [arb(-1)]
         row[axis] = arb(2 * end - 1)
+        self.model.budget.balls(4 * len(self.inside) * (self.n + 1) ** 2)
         z = [arb(0, 1)] * self.n + [arb(1)]
         z[axis] = row[axis]
         if not any(value(form, z) < 0 for form in self.inside):
@@ -134,6 +137,8 @@ class Surroundings:
             raise Unproved("the starts were not shown to lie in the working box")
 
     def _check_start(self, form: arb_mat, label: str) -> None:
+        self.model.budget.balls(4 * (self.n + 1) ** 2)
+        self.model.budget.hold(2 * (self.n + 1) ** 2)
         if not value(form, [*(low.union(high) for low, high in self.start), arb(1)]) >= 0:
             raise Unproved(f"the starts were not shown to keep \"{label}\"")
 

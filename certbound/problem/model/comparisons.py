@@ -15,8 +15,8 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache
-from typing import Any
+from functools import cached_property, lru_cache, partial
+from typing import Any, Protocol
 
 from certbound.problem.model.tape import Node, Tape, needed
 
@@ -30,11 +30,22 @@ _MOST_BREAKS = 200  # pieces of time
 _INSTANT = Fraction(1, _STEEP)  # share of the horizon in which two sides may differ
 _POINTS, _MOST_NODES = 16, 2000  # at which, and of tapes of how many nodes, sides are computed
 _MOST_WORK = 4_000_000  # numbers that are computed for the times of one tape
-_TIME = ("input", 0)
+_PER_PLACE, _PER_NUMBER, _PER_BIT = 200, 8_000, 80
+"""Nanoseconds or more of a look at a node; of a fraction of a form, and of each of its bits (up to 4 operations)."""
+_MOST_LINE = 4_000  # bytes of a function of time in fractions of so many bits
+_TIME, _ONLY_TIME = ("input", 0), 1  # the atom, and what `_reads` says of its functions
 _TRUTHS = ("lt", "le", "eq", "ne")
 _DECIDING = (*_TRUTHS, "sign", "floor")
 
 Atom = tuple[object, ...]
+
+
+class Counter(Protocol):
+    """What counts nanoseconds of work and bytes of memory: the budget of a check."""
+
+    def spend(self, units: int) -> None: ...
+    def take(self, size: int) -> None: ...
+    def give(self, size: int) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +61,26 @@ class _Form:
     value: float | None = None
     loose: bool = False
 
+    @cached_property
+    def bits(self) -> list[int]:
+        """The lengths of all numerators and denominators."""
+        numbers = (self.offset, self.error, *self.slopes.values())
+        return [part.bit_length() for number in numbers for part in (number.numerator, number.denominator)]
+
     @property
     def small(self) -> bool:
         """Whether it may be used further: what has no end of digits or parts is no line."""
-        numbers = (self.offset, self.error, *self.slopes.values())
-        sizes = (part.bit_length() for number in numbers for part in (number.numerator, number.denominator))
-        return len(self.slopes) <= _MOST_ATOMS and max(sizes) < _MOST_BITS
+        return len(self.slopes) <= _MOST_ATOMS and max(self.bits) < _MOST_BITS
+
+    @property
+    def work(self) -> int:
+        """Nanoseconds of an operation that takes it."""
+        return len(self.bits) // 2 * _PER_NUMBER + sum(self.bits) * _PER_BIT
+
+    @property
+    def memory(self) -> int:
+        """Bytes of it, and of its part in a key."""
+        return 300 * len(self.bits) + sum(self.bits) // 4
 
     def size(self, horizon: Fraction) -> Fraction:
         """Bound of the absolute value; atoms beside time are taken for at most 1."""
@@ -69,8 +94,9 @@ class _Form:
 _NOTHING = _Form({}, Fraction(0), Fraction(0))
 
 
-@lru_cache(maxsize=128)
-def rounded_comparison(tape: Tape, horizon: float, samples: int = 0) -> str | None:
+def rounded_comparison(
+    tape: Tape, horizon: float, samples: int = 0, counter: Counter | None = None
+) -> str | None:
     """The first comparison of the tape that rounding decides, in words; None where there is none.
 
     Parameters
@@ -81,12 +107,24 @@ def rounded_comparison(tape: Tape, horizon: float, samples: int = 0) -> str | No
         The length of time.
     samples : int
         Where t is one of the ends of so many equal parts of the horizon only: the number of steps, or of holds.
+    counter : Counter, optional
+        Counts work and memory before they are done and taken, and raises where they are too much.
     """
+    return _known(tape, horizon, samples) if counter is None else _found(tape, horizon, samples, counter)
+
+
+@lru_cache(maxsize=128)
+def _known(tape: Tape, horizon: float, samples: int) -> str | None:
+    return _found(tape, horizon, samples, None)
+
+
+def _found(tape: Tape, horizon: float, samples: int, counter: Counter | None) -> str | None:
     if not any(node.op in _DECIDING for node in tape.nodes):
         return None
     discrete = samples == horizon
     whole = min(Fraction(horizon), Fraction(_LONGEST)) if math.isfinite(horizon) else Fraction(_LONGEST)
-    clock = _Clock(whole, min(samples, _LONGEST) if discrete else samples)
+    clock = _Clock(whole, min(samples, _LONGEST) if discrete else samples, counter)
+    clock.count(len(tape.nodes) * _PER_PLACE, len(tape.nodes) * (len(tape.inputs) // 8 + 100))
     seen = _reads(tape)
     forms: list[_Form] = []
     names: dict[Atom, Atom] = {}
@@ -95,13 +133,15 @@ def rounded_comparison(tape: Tape, horizon: float, samples: int = 0) -> str | No
         if not used:
             forms.append(_NOTHING)
             continue
+        clock.count(sum((forms[arg].work for arg in node.args), _PER_NUMBER) if node.op != "input" else _PER_NUMBER)
         if node.op in _DECIDING:
             given = [forms[arg] for arg in node.args]
             over = given[0] if len(given) == 1 else _sum(given[0], given[1], -1, clock.whole, rounds=False)
             if _unclear(tape, index, over, seen, clock):
                 return tape.describe(index)
         forms.append(_form(node, index, forms, names, clock.whole, constant=not seen[index]))
-    found = None if samples else _unclear_on_pieces(tape, seen, clock.whole)
+        clock.count(0, forms[-1].memory)
+    found = None if samples else _unclear_on_pieces(tape, seen, clock)
     found = _unclear_at_points(tape, deciding, clock) if found is None else found
     return None if found is None else tape.describe(found)
 
@@ -112,7 +152,15 @@ class _Clock:
 
     whole: Fraction
     samples: int
+    counter: Counter | None
     work: int = _MOST_WORK
+
+    def count(self, work: int, memory: int = 0) -> None:
+        """Count work and memory, or give memory back, where anything counts."""
+        if self.counter is not None:
+            self.counter.spend(work)
+            self.counter.take(max(memory, 0))
+            self.counter.give(max(-memory, 0))
 
     def spend(self, work: int) -> bool:
         """Whether there is so much work left."""
@@ -130,11 +178,14 @@ class _Clock:
         return {k * (whole / self.samples), k * whole / self.samples, float(self.exact(k)), k * written}
 
 
-def _reads(tape: Tape) -> list[set[int]]:
-    """Input slots that each node depends on."""
-    found: list[set[int]] = []
+def _reads(tape: Tape) -> list[int]:
+    """Input slots that each node depends on, as the bits of a number."""
+    found: list[int] = []
     for node in tape.nodes:
-        found.append({node.args[0]} if node.op == "input" else set().union(*(found[arg] for arg in node.args)))
+        own = 1 << node.args[0] if node.op == "input" else 0
+        for arg in node.args if node.op != "input" else ():
+            own |= found[arg]
+        found.append(own)
     return found
 
 
@@ -236,13 +287,13 @@ def _computed(node: Node, values: Sequence[float]) -> float | None:
         return None
 
 
-def _unclear(tape: Tape, index: int, over: _Form, seen: Sequence[set[int]], clock: _Clock) -> bool:
+def _unclear(tape: Tape, index: int, over: _Form, seen: Sequence[int], clock: _Clock) -> bool:
     """Whether rounding may decide what is compared with 0 (``floor``: with whole numbers)."""
     op, own = tape.nodes[index].op, seen[index]
     if not own and not over.slopes and over.value is not None:
         near = over.loose and _decides(op, over, Fraction(0))
         return near or _side(op, over.offset) != _side(op, Fraction(over.value))
-    if clock.samples and own == {0}:
+    if clock.samples and own == _ONLY_TIME:
         return _unclear_at_samples(tape, index, over, clock)
     change = over.change(clock.whole)
     other = any(atom != _TIME for atom in over.slopes)
@@ -262,6 +313,7 @@ def _unclear_at_samples(tape: Tape, index: int, over: _Form, clock: _Clock) -> b
         return bool(over.error) and _decides(op, over, Fraction(0))
     else:
         times = list(range(clock.samples + 1))
+    clock.count(index * _PER_PLACE)
     part = _part(tape, index)
     if not clock.spend(len(times) * len(part)):
         return True
@@ -288,7 +340,8 @@ def _part(tape: Tape, index: int) -> list[int]:
 
 def _differs(tape: Tape, part: Sequence[int], k: int, clock: _Clock) -> bool:
     """Whether a program takes another side at a time than exact arithmetic does, for the last node of a part."""
-    side = _side_at(tape, part, clock.exact(k), _exact)
+    clock.count(len(part) * _PER_NUMBER)
+    side = _side_at(tape, part, clock.exact(k), partial(_exact, clock))
     return side is not None and any(_side_at(tape, part, time, _computed) != side for time in clock.rounded(k))
 
 
@@ -309,13 +362,15 @@ def _side_at(tape: Tape, part: Sequence[int], time: Any, compute: Callable[[Node
     return _side(last.op, Fraction(found[0]) - (Fraction(found[1]) if len(found) == 2 else 0))
 
 
-def _exact(node: Node, values: Sequence[Fraction]) -> Fraction | None:
+def _exact(clock: _Clock, node: Node, values: Sequence[Fraction]) -> Fraction | None:
     """The same as `_computed` in fractions; None of what is no fraction, or has no end of digits."""
     a, b = values[0], values[-1]
     if node.part is not None or node.op not in _RULES or (node.op == "div" and not b):
         return None
     value = Fraction(_RULES[node.op](a, b))
-    return value if max(value.numerator.bit_length(), value.denominator.bit_length()) < _MOST_BITS else None
+    bits = max(value.numerator.bit_length(), value.denominator.bit_length())
+    clock.count(bits * _PER_BIT)
+    return value if bits < _MOST_BITS else None
 
 
 def _unclear_at_points(tape: Tape, deciding: Sequence[int], clock: _Clock) -> int | None:
@@ -325,6 +380,7 @@ def _unclear_at_points(tape: Tape, deciding: Sequence[int], clock: _Clock) -> in
         return None
     drawn = random.Random(0)
     for _ in range(_POINTS):
+        clock.count(len(part) * _PER_NUMBER)
         point = [drawn.uniform(-1, 1) for _ in tape.inputs]
         point[0] = float(clock.whole) * drawn.random() if not clock.samples else min(
             clock.rounded(drawn.randrange(clock.samples + 1)))
@@ -332,7 +388,7 @@ def _unclear_at_points(tape: Tape, deciding: Sequence[int], clock: _Clock) -> in
         program: dict[int, Any] = {}
         for index in part:
             node = tape.nodes[index]
-            for values, number, compute in ((exact, Fraction, _exact), (program, float, _computed)):
+            for values, number, compute in ((exact, Fraction, partial(_exact, clock)), (program, float, _computed)):
                 if node.op in ("const", "input"):
                     values[index] = number(node.value if node.op == "const" else point[node.args[0]])
                 else:
@@ -344,17 +400,20 @@ def _unclear_at_points(tape: Tape, deciding: Sequence[int], clock: _Clock) -> in
     return None
 
 
-def _unclear_on_pieces(tape: Tape, seen: Sequence[set[int]], whole: Fraction) -> int | None:
+def _unclear_on_pieces(tape: Tape, seen: Sequence[int], clock: _Clock) -> int | None:
     """A comparison of functions of time that rounding decides for a while, where all are straight lines there.
 
     Between two times at which something jumps or bends: ``min(t, 0.1) < 0.1 + 0.3 - 0.3`` is one after 0.1.
     """
-    deciding = [index for index, node in enumerate(tape.nodes) if node.op in _DECIDING and seen[index] == {0}]
-    part = [index for index, used in enumerate(needed(tape.nodes, deciding)) if used and seen[index] <= {0}]
+    deciding = [index for index, node in enumerate(tape.nodes) if node.op in _DECIDING and seen[index] == _ONLY_TIME]
+    part = [index for index, used in enumerate(needed(tape.nodes, deciding)) if used and seen[index] <= _ONLY_TIME]
+    whole, held = clock.whole, len(part) * _MOST_LINE
+    clock.count(0, held)
     breaks, place = [Fraction(0), whole], 0
     while deciding and place + 1 < len(breaks) and len(breaks) < _MOST_BREAKS:
         first, last = breaks[place : place + 2]
-        found, jump = _pieces(tape, part, first, last)
+        clock.count(len(deciding) * _PER_PLACE)
+        found, jump = _pieces(tape, part, first, last, clock)
         if jump is not None:
             breaks.insert(place + 1, jump)
             continue
@@ -362,11 +421,13 @@ def _unclear_on_pieces(tape: Tape, seen: Sequence[set[int]], whole: Fraction) ->
             over = found.get(index)
             if over is None or not over.error or last - first <= _INSTANT * whole:
                 continue
+            clock.count(over.work)
             slope = abs(over.slopes.get(_TIME, Fraction(0)))
             nearest = min(_from_level(tape.nodes[index].op, over, time) for time in (first, last))
             if nearest <= over.error and (not slope or 2 * over.error > _INSTANT * whole * slope):
                 return index
         place += 1
+    clock.count(0, -held)
     return None
 
 
@@ -377,7 +438,7 @@ def _from_level(op: str, over: _Form, time: Fraction) -> Fraction:
 
 
 def _pieces(
-    tape: Tape, part: Sequence[int], first: Fraction, last: Fraction
+    tape: Tape, part: Sequence[int], first: Fraction, last: Fraction, clock: _Clock
 ) -> tuple[dict[int, _Form], Fraction | None]:
     """What is compared on a piece of time, as lines; and a time inside at which something jumps or bends."""
     lines: dict[int, _Form | None] = {}
@@ -386,6 +447,7 @@ def _pieces(
     for index in part:
         node = tape.nodes[index]
         given = [line for line in (lines.get(arg) for arg in node.args) if line is not None]
+        clock.count(sum((line.work for line in given), _PER_NUMBER))
         lines[index] = None
         if node.op in ("const", "input"):
             lines[index] = _form(node, index, [], {}, last, constant=False)

@@ -15,6 +15,8 @@ from certbound.problem.model.network_data import PARTS, Part
 
 T = TypeVar("T")
 
+_MOST_SHOWN = 4  # arguments of a network in a message
+
 ARITY: dict[str, int] = {
     "const": 0, "input": 1, "pow": 1,
     "neg": 1, "sq": 1, "sqrt": 1, "exp": 1, "log": 1, "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1,
@@ -103,6 +105,25 @@ class Tape:
                 values.append(arithmetic[node.op](*(values[arg] for arg in node.args)))
         return [values[output] for output in self.outputs]
 
+    def lives(self) -> tuple[list[list[int]], int]:
+        """The values that each operation is the last to need, and how many are there at once at most."""
+        last = list(range(len(self.nodes)))
+        for index, node in enumerate(self.nodes):
+            for arg in () if node.op == "input" else node.args:
+                last[arg] = index
+        for output in self.outputs:
+            last[output] = len(self.nodes)
+        ended: list[list[int]] = [[] for _ in self.nodes]
+        for place, index in enumerate(last):
+            if index < len(self.nodes):
+                ended[index].append(place)
+        there = most = 0
+        for places in ended:
+            there += 1
+            most = max(most, there)
+            there -= len(places)
+        return ended, most
+
     def describe(self, index: int) -> str:
         """The expression that node ``index`` stands for, for error messages (cut after 120 characters)."""
         text = self._expression(index, depth=6)
@@ -116,7 +137,9 @@ class Tape:
             return f"{node.value:g}"
         if depth == 0:
             return "..."
-        parts = [self._expression(arg, depth - 1) for arg in node.args]
+        parts = [self._expression(arg, depth - 1) for arg in node.args[:_MOST_SHOWN]]
+        if len(node.args) > _MOST_SHOWN:
+            parts.append("...")
         infix = dict(add="+", sub="-", mul="*", div="/", lt="<", le="<=", eq="==", ne="!=")  # noqa: C408  (shorter)
         if node.op in infix:
             return f"({parts[0]} {infix[node.op]} {parts[1]})"

@@ -151,7 +151,7 @@ def _by_rate(problem: Problem) -> EngineAnswer | None:
 
 
 def _failure(problem: Problem, limit: float, ratio: float) -> FailureBounds:
-    asked: dict[str, float] = {"seconds": limit, "delta": problem.delta, "ratio": ratio}
+    asked: dict[str, Any] = {"seconds": limit, "delta": problem.delta, "ratio": ratio}
     try:  # what noise along one direction leaves to chains otherwise
         found: FailureBounds | None = bound_directed_failure(problem, **asked)
     except InfeasibleError:

@@ -109,3 +109,60 @@ def test_in_discrete_time_every_step_counts(written: Written, *, found: bool) ->
 def test_where_inputs_are_held_every_sampling_time_counts(time: float, *, found: bool) -> None:
     """1/10 < 0.1 is true of the float next to a tenth, and a program that is asked at 0.1 says it is not."""
     assert (rounded_comparison(tape(lambda t, x, c: t < time), 1.0, 10) is not None) == found
+
+
+class Counted:
+    """Counts what a search takes, and ends it beyond a limit."""
+
+    def __init__(self, most: float = math.inf) -> None:
+        self.work = self.memory = self.highest = 0
+        self.most = most
+
+    def spend(self, units: int) -> None:
+        self.work += units
+        if self.work > self.most:
+            raise TimeoutError
+
+    def take(self, size: int) -> None:
+        self.memory += size
+        self.highest = max(self.highest, self.memory)
+
+    def give(self, size: int) -> None:
+        self.memory -= size
+
+
+def stairs(count: int) -> Tape:
+    """Comparisons of t/10 with as many numbers, and the sum of all before each."""
+    def written(t: Term, x: Term, c: Callable[[float], Term]) -> Term:
+        total = x
+        for k in range(count):
+            total = total + (t * 0.1 < 0.03 + 0.1 * k)
+        return total
+
+    return tape(written)
+
+
+def counted(given: Tape, horizon: float, samples: int = 0, most: float = math.inf) -> Counted:
+    counter = Counted(most)
+    assert rounded_comparison(given, horizon, samples, counter) == rounded_comparison(given, horizon, samples)
+    return counter
+
+
+@pytest.mark.parametrize(("horizon", "samples"), [(2.0, 0), (2.0, 20), (20.0, 20)])
+def test_a_counter_changes_nothing_and_sees_all_work_and_memory(horizon: float, samples: int) -> None:
+    few, many = (counted(stairs(count), horizon, samples) for count in (40, 80))
+    assert many.work > 1.9 * few.work > 1e6
+    assert many.highest > 1.9 * few.highest > 1e4
+
+
+def test_looking_for_what_each_of_many_comparisons_needs_counts_the_operations_before_it() -> None:
+    few, many = (counted(stairs(count), 20.0, 20) for count in (1000, 2000))
+    assert many.work > 2.3 * few.work
+
+
+def test_steps_at_which_a_comparison_is_computed_are_counted_before() -> None:
+    square = tape(lambda t, x, c: t * t * t < 0.3)
+    few, many = (counted(square, steps, int(steps)) for steps in (100.0, 10_000.0))
+    assert many.work > 50 * few.work
+    with pytest.raises(TimeoutError):
+        rounded_comparison(square, 10_000.0, 10_000, Counted(few.work))

@@ -24,7 +24,7 @@ from flint import arb
 
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model, SafeSet, starts_of
-from certbound.checker.values.batches import Array, Mask, above, below, terms
+from certbound.checker.values.batches import Array, Mask, above, below
 from certbound.checker.values.crossing import Crossing
 from certbound.checker.values.passage import Passage
 from certbound.checker.values.step_back import target_of
@@ -167,17 +167,12 @@ class _FailingAbove(Passage):
         return _window(self.model)
 
     def _missing(self) -> float:
-        least = float(_known(self._low_at_end()[~self.ended.over.ravel()]).min())
+        least = float(_known(self.last_ends()[0][~self.ended.over]).min())
         for axis, end in itertools.product(range(self.model.dimension), (0, 1)):
             beside = self.ended.beside(axis, end)
             if beside.any():
                 least = min(least, float(self.across(axis, -end)[0].reshape(-1, beside.size)[:, beside].min()))
         return -min(least, 0.0)
-
-    def _low_at_end(self) -> Array:
-        n = self.model.dimension
-        patches = self.surface.frozen(-1).patches(0, 1)
-        return patches.derivative(terms(n + 1, 5 + 3 * (n - 1)), (0,) * (n + 1)).sharp_ends()[0]
 
     def _at_end(self) -> float:
         return float(np.nextafter(self.ended.around()[0] + self.lift, -np.inf))

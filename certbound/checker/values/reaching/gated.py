@@ -15,6 +15,7 @@ next grid, and at the last end, exp(V) <= W. A path on any other part has failed
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -25,7 +26,7 @@ from certbound.checker.reading import Record, entries
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Constraint, Model, SafeSet
 from certbound.checker.values import batches as tm
-from certbound.checker.values.batches import Array, Mask
+from certbound.checker.values.batches import Array
 from certbound.checker.values.crossing import Crossing
 from certbound.checker.values.passage import Passage
 from certbound.errors import CertificateError
@@ -34,6 +35,10 @@ MOST_STAGES = 50
 _OWN = ("axes", "times", "values", "rates", "lam", "eps")
 _HALVINGS = 40  # of a part of a line across which a gate ends
 _FEW = 64
+_CHUNK = 4096
+"""Parts of a gate that are looked at together."""
+_PART_BYTES = 1_500
+"""Memory of a part of a gate and its box of balls."""
 
 Box = tuple[list[arb], list[arb]]
 Span = tuple[float, float]
@@ -86,6 +91,8 @@ class _Joint:
         edges = [axis if after is None else _merged(axis, after.surface.axes[i]) for i, axis in enumerate(axes)]
         if len(edges) == 1:
             edges = [_cut(edges[0], gate)]
+        many = math.prod(len(row) - 1 for row in edges)
+        stage.budget.take(many * _PART_BYTES)
         rows = [np.meshgrid(*ends, indexing="ij") for ends in ([e[:-1] for e in edges], [e[1:] for e in edges])]
         self.low, self.high = (np.stack([part.ravel() for part in row]) for row in rows)
         boxes = [_box(low, high) for low, high in zip(self.low.T, self.high.T)]
@@ -93,26 +100,33 @@ class _Joint:
             stage.budget.box()
         self.within = np.array([gate.holds(*box) for box in boxes])
         self.off = np.array([gate.excludes(*box) for box in boxes])
-        here = self._over(stage, -1)
-        least, most = here.sharp_ends()
-        self.least = np.where(np.isnan(least), -np.inf, least)
-        self.most = np.where(np.isnan(most), np.inf, most)
+        self.least, self.most = np.empty(len(boxes)), np.empty(len(boxes))
         self.goes_on = np.zeros(len(boxes), dtype=bool)
         self.gap = np.full((2, len(boxes)), np.nan)
         if after is not None:
             ends = [(axis[0], axis[-1]) for axis in after.surface.axes]
             self.goes_on = np.all([(low >= a) & (high <= b) for (a, b), low, high in zip(ends, self.low, self.high)], 0)
-            there = self._over(after, 0, self.goes_on)
-            found = tm.sub(there, here.take(np.flatnonzero(self.goes_on))).sharp_ends()
-            self.gap[:, self.goes_on] = np.array(found) + after.lift
-            self.gap += np.array([[-1.0], [1.0]]) * 2.0**-50 * (np.abs(self.gap) + abs(after.lift))
+        for first in range(0, len(boxes), _CHUNK):
+            self._look(stage, after, np.arange(first, min(first + _CHUNK, len(boxes))))
 
-    def _over(self, stage: Passage, index: int, which: Mask | None = None) -> tm.Batch:
-        """V of a stage on the parts, at one of its ends."""
-        low, high = (self.low, self.high) if which is None else (self.low[:, which], self.high[:, which])
+    def _look(self, stage: Passage, after: Passage | None, parts: tm.Index) -> None:
+        """V on some of the parts, and what is between it and V of the next stage."""
+        here = self._over(stage, -1, parts)
+        least, most = here.sharp_ends()
+        self.least[parts] = np.where(np.isnan(least), -np.inf, least)
+        self.most[parts] = np.where(np.isnan(most), np.inf, most)
+        on = np.flatnonzero(self.goes_on[parts])
+        if after is not None and len(on):
+            found = tm.sub(self._over(after, 0, parts[on]), here.take(on)).sharp_ends()
+            gap = np.array(found) + after.lift
+            gap += np.array([[-1.0], [1.0]]) * 2.0**-50 * (np.abs(gap) + abs(after.lift))
+            self.gap[:, parts[on]] = gap
+
+    def _over(self, stage: Passage, index: int, parts: tm.Index) -> tm.Batch:
+        """V of a stage on some parts, at one of its ends."""
+        low, high = self.low[:, parts], self.high[:, parts]
         places = [np.searchsorted(axis, row, side="right") - 1 for axis, row in zip(stage.surface.axes, low)]
-        patches = stage.surface.frozen(index).patches(0, 1).take(np.ravel_multi_index(places, stage.surface.cells))
-        return stage.part_of(patches, list(low), list(high))
+        return stage.part_of(stage.surface.chosen(index, places), list(low), list(high))
 
 
 class _StageAbove(Passage):
