@@ -138,4 +138,5 @@ def _visited(problem: Problem, low: Array, high: Array, inner_low: Array, inner_
             seen.append(x[:, alive])
     points = np.concatenate(seen, axis=1)
     points = points[:, np.isfinite(points).all(axis=0)]
-    return np.quantile(points, [_RARE, 1 - _RARE], axis=1)
+    least, most = np.quantile(points, [_RARE, 1 - _RARE], axis=1)
+    return np.array([np.minimum(least, low.min(axis=0)), np.maximum(most, high.max(axis=0))])

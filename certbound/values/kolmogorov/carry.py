@@ -27,6 +27,7 @@ from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_de
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
 _MARGIN = 0.1  # by which a source exceeds what it pays for
+_LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
 _SOFT = 3.0
 _KILL = 10.0
@@ -175,6 +176,11 @@ class Side:
     def work(self) -> int:
         """Cells of space and time."""
         return int(np.prod([axis.cells for axis in self.axes])) * len(self.steps)
+
+    @property
+    def finite(self) -> bool:
+        """Whether every coefficient is a number that no derivative overflows with: nothing is proved of others."""
+        return all(bool(np.all(np.abs(row) < _LARGEST)) for rows in (self.values, self.rates) for row in rows)
 
     def _goal(self, limit: bool) -> float:
         return 1.0 if self.above else -1.0 if limit else 0.0

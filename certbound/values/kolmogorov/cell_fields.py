@@ -83,7 +83,8 @@ class Fields:
         EnclosureError
             The function is undefined or unbounded somewhere on the grid.
         """
-        points, _ = self._enclosed(self.tape, [axis.lattice for axis in axes], None, time, branch)
+        rims = [_about(axis) for axis in axes]
+        points, _ = self._enclosed(self.tape, [low for low, _ in rims], [high for _, high in rims], time, branch)
         ends = [axis.nodes for axis in axes]
         ranges, edge = self._enclosed(self.tape, [e[:-1] for e in ends], [e[1:] for e in ends], time, branch)
         tails = [
@@ -96,10 +97,9 @@ class Fields:
         return result
 
     def _enclosed(
-        self, tape: Tape, low: list[Array], high: list[Array] | None, time: Interval, branch: Sequence[Interval]
+        self, tape: Tape, low: list[Array], high: list[Array], time: Interval, branch: Sequence[Interval]
     ) -> tuple[list[Interval], Mask]:
-        lows = np.meshgrid(*low, indexing="ij", sparse=True)
-        highs = lows if high is None else np.meshgrid(*high, indexing="ij", sparse=True)
+        lows, highs = (np.meshgrid(*ends, indexing="ij", sparse=True) for ends in (low, high))
         values, edge = enclose(tape, [time, *(Interval(a, b) for a, b in zip(lows, highs)), *branch])
         shape = tuple(map(len, low))
         return [value.broadcast_to(shape) for value in values], np.broadcast_to(edge, shape)
@@ -139,6 +139,13 @@ class Fields:
                 rows.append((spread * over_cells(axes, along, skip=k) + rounding) / width**order * _UP)
             slopes.append(tuple(rows))
         return Field(lattice=lattice, error=error * _UP, slopes=tuple(slopes))
+
+
+def _about(axis: Axis) -> tuple[Array, Array]:
+    """Ends of intervals around the lattice points, which are rounded, within the axis."""
+    off = 4 * np.spacing(np.abs(axis.nodes).max())
+    low, high = axis.nodes[0], axis.nodes[-1]
+    return np.maximum(axis.lattice - off, low), np.minimum(axis.lattice + off, high)
 
 
 def _along(values: Array, axis: int, dimension: int) -> Array:

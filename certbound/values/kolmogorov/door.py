@@ -135,6 +135,8 @@ def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float
     while True:
         passes += 1
         poll("solving for the error that is left")
+        if not (side.finite and starts.within(side)):
+            return best, math.inf, passes
         residuals = side.residuals()
         left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
         missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
@@ -153,6 +155,11 @@ class Starts:
     low: Array
     high: Array
     points: Array
+
+    def within(self, side: Side) -> bool:
+        """Whether they lie in the box of a side."""
+        ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
+        return bool(np.all(self.low >= ends[0]) and np.all(self.high <= ends[1]))
 
 
 def starts_in(problem: Problem) -> Starts:

@@ -70,6 +70,15 @@ def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -
         assert -bound <= truth * (1 + 1e-3)
 
 
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e200])
+def test_a_proposal_that_blew_up_proves_nothing(poison: float) -> None:
+    problem, _ = two_independent()
+    side = Side(setting_of(problem), np.full(2, 0.1), 12, True)
+    side.propose()
+    side.values[3][7, 7] = poison
+    assert refined(side, starts_in(problem))[0] == np.inf
+
+
 def test_all_starts_of_a_box_are_covered_from_above_and_the_worst_counts_from_below() -> None:
     problem, _ = two_independent()
     center, corner = last(problem.replace(initial=[0.0, 0.0])), last(problem.replace(initial=[0.4, 0.4]))
