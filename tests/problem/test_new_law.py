@@ -118,7 +118,7 @@ def test_it_is_saved_and_loaded_under_its_name(tmp_path):
 def test_without_a_row_the_checker_refuses_it():
     problem = walk(ArcSine(halfwidth=0.1))
     text = cb.verify_safety(problem, method="linear").certificate_text
-    with pytest.raises(CertificateError, match=r"`problem\.noise\.law` must be one of gaussian, .*got 'arcsine'"):
+    with pytest.raises(CertificateError, match=r"`problem\.noise\.law` must be one of gaussian, .*got \"arcsine\""):
         check_data(parse(text(problem)))
 
 

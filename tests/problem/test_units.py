@@ -76,7 +76,7 @@ def test_files_and_certificates_keep_them(problem, verdict, tmp_path):
     report = check_data(parse(text), given[0])
     assert report.valid, report.reason
     assert "units.time differs" in check_data(parse(text), given[1]).reason  # the claim names it
-    assert "within 2 days" in report.claim
+    assert 'within 2 "days"' in report.claim
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,8 @@ def walk() -> cb.Problem:
 
 def scripted(monkeypatch: pytest.MonkeyPatch, clock: Time, scripts: dict[str, Script]) -> None:
     """Engines by script; where they are not asked thoroughly they leave out half of their work, and what it proves."""
-    plain: dict[str, Any] = {"sketch": False, "again": False, "soon": 0, "spares": 0, "chance": None, "below": None}
+    plain: dict[str, Any] = {"sketch": False, "again": False, "soon": 0, "spares": 0, "chance": None, "below": None,
+                             "drawn": False}
 
     def row(name: str, script: Script | None) -> Any:
         def prove(problem: cb.Problem, request: Request) -> EngineAnswer:

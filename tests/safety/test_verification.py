@@ -330,7 +330,7 @@ def test_dynamics_that_are_undefined_at_the_start_are_refused():
 
 
 def test_an_unknown_method_is_refused():
-    with pytest.raises(ValueError, match="`method` must be one of auto, linear, constants, barrier"):
+    with pytest.raises(ValueError, match="`method` must be one of auto, starts, linear, constants, barrier"):
         verify_safety(brownian(), method="magic")
 
 

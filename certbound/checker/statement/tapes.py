@@ -152,12 +152,13 @@ def canonical(data: Mapping[str, Any]) -> list[Any]:
         stack = [place[output]]
         while stack:
             number_ = stack[-1]
+            if number_ in found:
+                stack.pop()
+                continue
             key = keys[number_]
             args = _arguments(key)
             missing = [arg for arg in args if arg not in found]
-            if number_ in found:
-                stack.pop()
-            elif missing:
+            if missing:
                 stack.extend(reversed(missing))
             else:
                 found[number_] = len(result)

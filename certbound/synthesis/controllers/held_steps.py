@@ -69,6 +69,9 @@ class _Held(Flow):
     def plan_rows(self, starts: ArrayLike) -> Array:
         return np.tile(np.asarray(self.row, dtype=float), (len(np.asarray(starts)), 1))
 
+    def plan_ranges(self, starts: ArrayLike) -> Interval:
+        return Interval.point(self.plan_rows(starts))
+
 
 @dataclass(eq=False, kw_only=True)
 class HeldSteps:
