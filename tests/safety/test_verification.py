@@ -310,7 +310,7 @@ def test_the_deviation_is_given_per_piece_and_state():
 def test_the_engines_run_side_by_side_and_the_smallest_probability_is_kept():
     problem = brownian(sigma=0.25)
     verdict = verify_safety(problem)
-    assert set(verdict.answers) == {"linear", "constants", "barrier", "values", "quadratic"}
+    assert set(verdict.answers) == {"linear", "constants", "barrier", "values", "quadratic", "backward"}
     assert verdict.log10_delta == min(answer.log10_delta for answer in verdict.answers.values())
     assert verdict.log10_delta <= by_constants(problem).log10_delta
 
@@ -330,7 +330,7 @@ def test_dynamics_that_are_undefined_at_the_start_are_refused():
 
 
 def test_an_unknown_method_is_refused():
-    with pytest.raises(ValueError, match="`method` must be one of auto, starts, linear, constants, barrier"):
+    with pytest.raises(ValueError, match="`method` must be one of auto, starts, linear, constants, backward, barrier"):
         verify_safety(brownian(), method="magic")
 
 
