@@ -20,6 +20,7 @@ import pytest
 from certbound.cli import main
 from certbound.cli.app import run
 from certbound.cli.clock import Clock
+from certbound.cli.commands.simulate import FIRST
 from certbound.cli.output import SETTINGS
 from certbound.safety.portfolio import ENGINES
 from certbound.watch import OutOfTime, Watch, poll
@@ -189,8 +190,8 @@ def test_no_paths_in_time_is_a_failure_and_some_are_an_answer(
     words = ("simulate", "ou", "--step", "0.05", "--seed", "1", "--paths", "1e12")
     assert run([*words[:-1], "10"]) == 0  # compiles
     capsys.readouterr()
-    slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda options: options["paths"] > 2000)
-    assert answer(capsys, *words, "--time-limit", "0.4")[1]["paths"] == 2000
+    slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda options: options["paths"] > FIRST)
+    assert answer(capsys, *words, "--time-limit", "0.4")[1]["paths"] == FIRST
     slowed(monkeypatch, "certbound.simulation.estimates", "simulate_exits", lambda _: True)
     assert run([*words, "--time-limit", "0.1"]) == 3
     assert "no paths were simulated within 0.1 s" in capsys.readouterr().err
