@@ -121,6 +121,8 @@ def refined(side: Side, starts: Starts) -> tuple[float, int]:
     while passes < _PASSES:
         passes += 1
         poll("solving for the error that is left")
+        if not side.known():  # the numerics broke down
+            break
         residuals = side.residuals()
         left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
         missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
@@ -162,13 +164,17 @@ def starts_in(problem: Problem) -> Starts:
 def largest_at_start(side: Side, starts: Starts) -> tuple[float, float]:
     """v(0, .) over the starts: roughly at the worst of them, and the certified number of the side.
 
-    From above that is an upper bound over all starts; from below the least of v over some of them, rounded up.
+    From above that is an upper bound over all starts; from below the least of v over some of them, rounded up. Of
+    starts beyond the box of the axes, where v is not known, 1 is said from above and 0 from below.
     """
     coefficients = side.values[-1]
+    ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
     if not side.above:
-        values = [_value(side, coefficients, point) for point in starts.points]
-        low = min(values)
+        within = np.all((starts.points >= ends[0]) & (starts.points <= ends[1]), axis=1)
+        low = min((_value(side, coefficients, point) for point in starts.points[within]), default=0.0)
         return low, low + _rounding(coefficients)
+    if np.any(starts.low < ends[0]) or np.any(starts.high > ends[1]):
+        return 1.0, 1.0
     best, rough = -math.inf, -math.inf
     derivatives = Derivatives(side.axes, coefficients[None])
     n = len(side.axes)
