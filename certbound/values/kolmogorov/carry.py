@@ -33,6 +33,7 @@ _SOFT = 3.0
 _KILL = 10.0
 _REACHED = 1.5
 _BATCH = 20000
+_CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
 
 def ramp(y: Array) -> Array:
@@ -157,7 +158,8 @@ class Side:
         self.axes = tuple(Axis(line, Sampling(parts or (4 if len(nodes) < 3 else 2))) for line in nodes)
         self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer)
         self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer)
-        self.steps = time_steps(setting.horizon, steps, self.layer)
+        longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
+        self.steps = time_steps(setting.horizon * longer, steps, self.layer)
         everywhere = Interval.point(0.0)
         self.generator = Generator.of(
             self.axes, setting.drift.on(self.axes, everywhere), setting.square.on(self.axes, everywhere)
@@ -237,7 +239,7 @@ class Side:
         lowest = np.minimum.reduce(parts)
         for axis in range(len(self.axes)):
             lowest = -sliding_max(-lowest, axis + 1, DEGREE + 1)
-        return np.asarray(lowest >= (1.0 if self.above else 0.0) + 1e-12)
+        return np.asarray(lowest >= (1.0 if self.above else 0.0) + 1e-12 * np.abs(parts).max())
 
     def correct(self, residuals: list[Array]) -> None:
         """Solve for the error that the residuals leave, and for what v lacks at exits and at the end; add it to v."""

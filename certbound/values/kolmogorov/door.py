@@ -135,7 +135,7 @@ def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float
     while True:
         passes += 1
         poll("solving for the error that is left")
-        if not (side.finite and starts.within(side)):
+        if not side.finite:
             return best, math.inf, passes
         residuals = side.residuals()
         left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
@@ -155,11 +155,6 @@ class Starts:
     low: Array
     high: Array
     points: Array
-
-    def within(self, side: Side) -> bool:
-        """Whether they lie in the box of a side."""
-        ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
-        return bool(np.all(self.low >= ends[0]) and np.all(self.high <= ends[1]))
 
 
 def starts_in(problem: Problem) -> Starts:
@@ -183,13 +178,17 @@ def starts_in(problem: Problem) -> Starts:
 def largest_at_start(side: Side, starts: Starts) -> tuple[float, float]:
     """v(0, .) over the starts: roughly at the worst of them, and the certified number of the side.
 
-    From above that is an upper bound over all starts; from below the least of v over some of them, rounded up.
+    From above that is an upper bound over all starts; from below the least of v over some of them, rounded up. Of
+    starts beyond the box of the axes, where v is not known, 1 is said from above and 0 from below.
     """
     coefficients = side.values[-1]
+    ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
     if not side.above:
-        values = [_value(side, coefficients, point) for point in starts.points]
-        low = min(values)
+        within = np.all((starts.points >= ends[0]) & (starts.points <= ends[1]), axis=1)
+        low = min((_value(side, coefficients, point) for point in starts.points[within]), default=0.0)
         return low, low + _rounding(coefficients)
+    if np.any(starts.low < ends[0]) or np.any(starts.high > ends[1]):
+        return 1.0, 1.0
     best, rough = -math.inf, -math.inf
     derivatives = Derivatives(side.axes, coefficients[None])
     n = len(side.axes)

@@ -35,7 +35,7 @@ class Face:
 
 
 def face_of(axes: Sequence[Axis], drift: Fields, noisy: bool, axis: int, side: int, goal: float) -> Face:
-    """The face, with the cells where paths can leave by outward-rounded enclosures of the drift."""
+    """The face, with the cells where paths can leave by outward-rounded enclosures of the drift on and before it."""
     others = [one for k, one in enumerate(axes) if k != axis]
     shape = tuple(one.cells for one in others)
     if noisy:
@@ -44,7 +44,8 @@ def face_of(axes: Sequence[Axis], drift: Fields, noisy: bool, axis: int, side: i
     ends = [(one.nodes[:-1], one.nodes[1:]) for one in others]
     lows, highs = (np.meshgrid(*rows, indexing="ij", sparse=True) for rows in zip(*ends))
     boxes = [Interval(low, high) for low, high in zip(lows, highs)]
-    boxes.insert(axis, Interval.point(place))
+    inward = float(np.nextafter(place, np.inf if side == 0 else -np.inf))  # the drift may jump on the face
+    boxes.insert(axis, Interval(min(place, inward), max(place, inward)))
     values, _ = enclose(drift.tape, [Interval.point(0.0), *boxes])
     across = values[axis].broadcast_to(shape)
     leaves = across.hi >= 0 if side else across.lo <= 0

@@ -12,7 +12,7 @@ On a cell let p be the tensor interpolant of r_j at the cell's lattice points, o
 Lebesgue constant C, the tail's constant c and gaps g of `splines.Sampling`, and h_i the cell's widths. With drift and
 noise replaced by their own interpolants (`coefficients`), whose errors are paid by the size of v's derivatives,
 
-    r_j <= max p(lattice) + C^(n-1) g^2 / 8 sum_i max (-h_i^2 d_ii p along the lattice lines)^+     (a chord's error)
+    r_j <= max p(lattice) + g^2 / 8 sum_i max (-h_i^2 d_ii p)^+                    (chords, `most_of_interpolants`)
            + sum_i C^i c h_i^(m+1) sup |d_i^(m+1) r_j|                                     (the interpolation's error),
 
 and d_i^(m+1) r_j is bounded term by term: d^(m+1) (F D) = sum_k binomial(m + 1, k) d^k F d^(m+1-k) D, d^(m+1) F = 0.
@@ -34,9 +34,9 @@ from certbound.values.kolmogorov.splines import (
     ROUNDOFF,
     Axis,
     Derivatives,
-    cell_combinations,
+    amplified,
+    most_of_interpolants,
     outer,
-    over_cells,
     plus,
     unit,
 )
@@ -112,7 +112,7 @@ class Generator:
         for orders, field, weight in self.terms:
             factors = [axis.condition[order] for axis, order in zip(self.axes, orders)]
             total = total + weight * field.slopes[0][0] * outer(factors) * sizes(zero)
-        return np.asarray(4 * ROUNDOFF * total)
+        return np.asarray((1 + amplified(self.axes)) * ROUNDOFF * total)
 
 
 Part = tuple[Derivatives, "slice[Any, Any, Any]", Any]
@@ -158,16 +158,11 @@ def residual_bound(generator: Generator, values: Array, rates: Array, steps: Arr
     # m = 3 (b_2 - b_1) / h; the raised coefficients of v_t are D_k, (D_k + 2 m) / 3, (2 m + D_{k+1}) / 3, D_{k+1}
     middle = 2 * (value[late] - value[early]) / h - (2 / 3) * (rate[early] + rate[late])
     bound = np.full((len(steps), *(axis.cells for axis in axes)), -np.inf)
-    factor = float(np.prod([axis.sampling.lebesgue for axis in axes]))
     for residual in (
         rate[early] + image[early], rate[early] / 3 + middle + (image[early] + h / 3 * image_of_rate[early]),
         middle + rate[late] / 3 + (image[late] - h / 3 * image_of_rate[late]), rate[late] + image[late],
     ):  # fmt: skip
-        high = over_cells(axes, residual)
-        for k, axis in enumerate(axes):
-            bends = cell_combinations(residual, k + 1, -axis.sampling.derivative(2))
-            high += factor / axis.sampling.lebesgue * axis.sampling.chord * over_cells(axes, bends, skip=k)
-        bound = np.maximum(bound, high)
+        bound = np.maximum(bound, most_of_interpolants(axes, residual))
     sizes, speeds = _sizes(axes, values, rates, h)
     extra = generator.remainder(sizes, speeds) + generator.roundoff(sizes, speeds, h)
     return np.asarray(bound + extra * _UP)

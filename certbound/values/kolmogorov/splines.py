@@ -20,7 +20,7 @@ import numpy as np
 
 from certbound.arrays import Array, Index
 from certbound.lazy import compiled
-from certbound.values.polynomials import lebesgue, nodes_of, to_bernstein
+from certbound.values.polynomials import lebesgue, nodes_of, norm, to_bernstein
 
 DEGREE = 5
 ROUNDOFF = 200 * 2.0**-53
@@ -30,6 +30,11 @@ roundings lie on the way from a coefficient to a value (six of de Boor's recursi
 
 _MANY = 64 * 2.0**-53
 """Relative error of a control value against the sum of the magnitudes of its terms: three roundings a difference."""
+
+
+_OFF = 10 * 21.1 * 2.0**-53
+"""Error of a Bernstein coefficient against the largest control value, for each rounding of a point by a share of its
+cell: the slope is at most 10, the norm of `to_bernstein(6)` is 21."""
 
 
 @compiled
@@ -256,6 +261,18 @@ class Axis:
         return np.append(inner.ravel(), self.nodes[-1])
 
     @cached_property
+    def bends(self) -> Banded:
+        """From lattice values to the Bernstein coefficients of minus each interpolant's second derivative by shares."""
+        rows = -self.sampling.derivative(2)
+        start = np.repeat(np.arange(self.cells) * self.sampling.parts, len(rows))
+        return Banded(start.astype(np.intp), np.tile(rows, (self.cells, 1)))
+
+    @cached_property
+    def moved(self) -> Array:
+        """Per cell, its distance from 0 in cells: by so many roundings, as shares of the cell, its points are off."""
+        return np.maximum(np.abs(self.nodes[1:]), np.abs(self.nodes[:-1])) / self.widths
+
+    @cached_property
     def widths(self) -> Array:
         """Widths of the cells, rounded up, shape (N,)."""
         return np.diff(self.nodes) * (1 + 1e-15)
@@ -311,9 +328,8 @@ class Axis:
         Where a lattice point is rounded, the sum grows by the share of a cell that this moves it.
         """
         sums = [one.absolute() for one in self.on_lattice]
-        moved = 1 + np.maximum(np.abs(self.nodes[1:]), np.abs(self.nodes[:-1])) / self.widths
         parts = self.sampling.parts
-        first, second, third = (moved * sliding_max(row, 0, parts + 1, parts) for row in sums)
+        first, second, third = ((1 + self.moved) * sliding_max(row, 0, parts + 1, parts) for row in sums)
         return first, second, third
 
     @cached_property
@@ -394,7 +410,10 @@ def most_on_cells(axes: tuple[Axis, ...], coefficients: Array) -> Array:
     size = np.abs(coefficients)
     for k in range(len(axes)):
         size = sliding_max(size, k + 1, DEGREE + 1)
-    return np.asarray(value + 1e-11 * size)
+    share = np.full(cells_of(axes), 1e-11)
+    for k, axis in enumerate(axes):
+        share += _OFF * axis.moved.reshape([-1 if j == k else 1 for j in range(len(axes))])
+    return np.asarray(value + share * size)
 
 
 def over_cells(axes: tuple[Axis, ...], lattice: Array, skip: int | None = None) -> Array:
@@ -407,6 +426,35 @@ def over_cells(axes: tuple[Axis, ...], lattice: Array, skip: int | None = None) 
         if k != skip:
             lattice = sliding_max(lattice, ahead + k, axis.sampling.parts + 1, axis.sampling.parts)
     return lattice
+
+
+def most_of_interpolants(axes: tuple[Axis, ...], lattice: Array, windows: tuple[tuple[int, int], ...] = ()) -> Array:
+    """A bound of the polynomials through the lattice values on every cell, from above, by chords, axis by axis.
+
+    With J the piecewise linear interpolation along an axis, p <= J p + gap^2 / 8 sup (-d^2 p)^+ along it: J p and the
+    coefficients of -d^2 p are bounded over the axes behind it in the same way. That -d^2 p be negative on the lines of
+    the lattice would not do, even times a Lebesgue constant: between them its positive part may be anything. The
+    tensor's last axes are those of the grid; ``windows`` says how many values a cell has along the first of them, and
+    how far apart cells begin.
+    """
+    k, ahead = len(windows), lattice.ndim - len(axes)
+    if k == len(axes):
+        for place, (count, stride) in enumerate(windows):
+            lattice = sliding_max(lattice, ahead + place, count, stride)
+        return lattice
+    sampling = axes[k].sampling
+    high = most_of_interpolants(axes, lattice, (*windows, (sampling.parts + 1, sampling.parts)))
+    if k == len(axes) - 1:
+        bends, window = cell_combinations(lattice, ahead + k, -sampling.derivative(2)), (1, 1)
+    else:
+        bends, window = axes[k].bends.along(lattice, ahead + k), (sampling.parts - 1, sampling.parts - 1)
+    extra = most_of_interpolants(axes, bends, (*windows, window))
+    return np.asarray(high + sampling.chord * np.maximum(extra, 0.0))
+
+
+def amplified(axes: tuple[Axis, ...]) -> float:
+    """By how much more than the lattice values, all off by 1, `most_of_interpolants` may be off."""
+    return float(np.prod([1 + axis.sampling.chord * norm(axis.sampling.derivative(2)) for axis in axes]))
 
 
 def cells_of(axes: tuple[Axis, ...]) -> tuple[int, ...]:

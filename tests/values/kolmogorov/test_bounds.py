@@ -9,7 +9,8 @@ import certbound as cb
 from certbound.values.kolmogorov import bound_failing
 from certbound.values.kolmogorov.box_setting import setting_of
 from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.door import refined, starts_in
+from certbound.values.kolmogorov.door import largest_at_start, refined, starts_in
+from certbound.values.kolmogorov.face_exits import face_of
 
 SHARES = {"half": 0.5, "nothing": 0.0}
 
@@ -105,3 +106,38 @@ def test_three_states_are_bounded_from_above() -> None:
     side = Side(setting, np.full(3, 0.1), 10, True)
     side.propose()
     assert refined(side, starts_in(problem))[0] >= 0.005
+
+
+@pytest.mark.parametrize("far", [2.0, -2.0, 10.0, -10.0])
+@pytest.mark.parametrize("above", [True, False])
+def test_a_start_beyond_the_box_of_the_values_is_not_read_off_a_continued_spline(far: float, above: bool) -> None:
+    """Where a coordinate has no limit, the box holds nearly all paths, and perhaps not one start out of very many."""
+    problem = oscillator()
+    side = Side(setting_of(problem), np.full(2, 0.2), 8, above)
+    side.propose()
+    beyond = [side.axes[1].nodes[-1 if far > 0 else 0] + far]
+    starts = starts_in(problem.replace(initial=[cb.Box([0, 0], [0, 0]), cb.Box([0, *beyond], [0, *beyond])]))
+    found = largest_at_start(side, starts)[1]
+    assert found == (1.0 if above else largest_at_start(side, starts_in(problem))[1])
+
+
+def test_a_drift_that_turns_on_the_face_itself_lets_paths_leave_there() -> None:
+    system = cb.ContinuousSystem(
+        lambda x, y: [np.where(x < 1, 1.0, -1.0), -y], states=["x", "y"], diffusion=[[0.0], [0.5]]
+    )
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2.0)
+    setting = setting_of(problem)
+    side = Side(setting, np.full(2, 0.2), 8, True)
+    assert face_of(side.axes, setting.drift, False, 0, 1, 1.0).leaves.all()
+    assert not face_of(side.axes, setting.drift, False, 0, 0, 1.0).leaves.any()
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_the_steps_cover_the_horizon_from_above_and_stay_within_it_from_below(above: bool) -> None:
+    from fractions import Fraction
+
+    problem, _ = two_independent()
+    for horizon in (0.3, 0.7, 1.1, 2.0, 1e-5, 37.7):
+        side = Side(setting_of(problem.replace(horizon=horizon)), np.full(2, 0.2), 13, above)
+        total = sum(map(Fraction, side.steps.tolist()))
+        assert total >= Fraction(horizon) if above else total <= Fraction(horizon)

@@ -173,3 +173,23 @@ def test_settings_that_are_not_served_are_refused_by_name() -> None:
         problem = cb.Problem(system, initial=[0, 0], safe=stay, horizon=1 if words != "discrete" else 5)
         with pytest.raises(InfeasibleError, match=words):
             setting_of(problem)
+
+
+def test_a_hump_that_no_line_of_the_lattice_shows_is_bounded_in_three_states() -> None:
+    """A quadratic of three variables that is at most 1 at its lattice points, convex along each of their lines, and
+    1.0327 at (.2, .2, .2): there -d_kk p is positive."""
+    lattice = np.ones((3, 3, 3))
+    lattice[1, 1] = [1, 0, -1]
+    lattice[1, 2] = [1, -1, 1]
+    lattice[2, 1] = [1, -1, 1]
+    axes = tuple(Axis(np.arange(9.0), Sampling(2)) for _ in range(3))
+    basis = _lagrange(axes[0].sampling.nodes, np.arange(9.0) - 3.0)  # it fills the cell from 3 to 4
+    rows = [one.from_nodes() @ basis for one in axes]
+    rate = np.einsum("ia,jb,kc,abc->ijk", *rows, lattice)
+    values = np.stack([np.zeros_like(rate), -rate])
+    bound = residual_bound(Generator(axes=axes, terms=()), values, np.stack([rate, rate]), np.array([1.0]))
+    inside = np.append(np.random.default_rng(8).uniform(0, 1, (2000, 3)), [[0.2, 0.2, 0.2]], axis=0)
+    weights = [_lagrange(axes[0].sampling.nodes, inside[:, k]) for k in range(3)]
+    seen = np.einsum("pa,pb,pc,abc->p", *weights, lattice)
+    assert seen.max() > 1.03
+    assert np.all(seen <= bound[0, 3, 3, 3])
