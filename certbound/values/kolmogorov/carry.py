@@ -190,10 +190,6 @@ class Side:
         """What v(T) lacks of 0 on every cell."""
         return np.asarray(np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0))
 
-    def known(self) -> bool:
-        """Whether v is a number everywhere."""
-        return all(bool(np.isfinite(row).all()) for row in (*self.values, *self.rates))
-
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
         equation, span = self.mesh.equation, self.layer

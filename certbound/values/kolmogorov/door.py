@@ -121,8 +121,6 @@ def refined(side: Side, starts: Starts) -> tuple[float, int]:
     while passes < _PASSES:
         passes += 1
         poll("solving for the error that is left")
-        if not side.known():  # the numerics broke down
-            break
         residuals = side.residuals()
         left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
         missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
