@@ -10,7 +10,7 @@ r = v_t + L v is a cubic in time with coefficients r_j(x) = (v_t)_j + L b_j, and
 
 On a cell let p be the tensor interpolant of r_j at the cell's lattice points, of degree m along each axis, with the
 Lebesgue constant C, the tail's constant c and gaps g of `splines.Sampling`, and h_i the cell's widths. With drift and
-noise replaced by their own interpolants (`coefficients`), whose errors are paid by the size of v's derivatives,
+noise replaced by their own interpolants (`cell_fields`), whose errors are paid by the size of v's derivatives,
 
     r_j <= max p(lattice) + g^2 / 8 sum_i max (-h_i^2 d_ii p)^+                    (chords, `most_of_interpolants`)
            + sum_i C^i c h_i^(m+1) sup |d_i^(m+1) r_j|                                     (the interpolation's error),
