@@ -362,6 +362,7 @@ def _coarse_grids(monkeypatch: pytest.MonkeyPatch) -> None:
     """Value functions on grids that take little: rows ask on which side of the truth a bound lies."""
     monkeypatch.setattr(values, "_SECONDS", 1.0)
     monkeypatch.setattr(values, "_SPACE", 1.0)
+    monkeypatch.setattr(values, "_BACKWARD", 2.0)
 
 
 def one_of_each_kind() -> Iterator[Row]:

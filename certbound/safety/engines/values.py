@@ -32,8 +32,8 @@ _SPACE = 120.0  # the same for three states in continuous time
 _GRANT = 0.7  # of the time that is left, where all of it may be spent: what does not come to its end is lost
 _LEAST = 1e-3
 _FLOOR = -300.0
-_BACKWARD = 30.0  # of work, where it is asked alone
-_BRIEF = 0.5  # of that, where it is asked among others
+_BACKWARD = 20.0  # of work, where it is asked alone
+_BRIEF = 0.75  # of that, where it is asked among others
 _RATIO, _RATIO_WITH_EFFORT = 1.05, 1.0001  # of the two bounds below which grids are not refined
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
