@@ -371,10 +371,9 @@ def one_of_each_kind() -> Iterator[Row]:
         "rademacher avoid half-space", "rademacher start avoid box", "rademacher stay ball", "uniform start avoid box",
         "corners stay polygon", "corners avoid ball", "target and obstacle meet", "domain ends", "floor avoid",
         "line avoid half-space", "line start avoid box with one side", "line stay half-space",
-        "full random avoid half-space",
     }  # fmt: skip
     groups = [coin_rows(["rademacher"]), null_rows(), corner_rows(), target_rows(), domain_rows(), jump_rows(),
-              line_rows(["half-space", "box with one side"]), full_rows()]  # fmt: skip
+              line_rows(["half-space", "box with one side"])]  # fmt: skip
     found = [one for group in groups for one in group if one.name in wanted]
     assert {one.name for one in found} == wanted
     return iter(found)
