@@ -115,7 +115,10 @@ def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("parts", PARTS)
 @pytest.mark.parametrize("name", MODELS)
-def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(name: str, parts: int) -> None:
+@pytest.mark.parametrize("steady", [False, True])
+def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(
+    name: str, parts: int, steady: bool
+) -> None:
     rng = np.random.default_rng(5)
     axes = (axis(rng, 7, parts), axis(rng, 8, parts))
     g = np.array([[0.5, 0.0], [0.2, 0.4]])
@@ -123,6 +126,8 @@ def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(name:
     drift = fields_of(name).on(axes, Interval.point(0.0))
     generator = Generator.of(axes, drift, _constant_fields(axes, a))
     values, rates = rng.normal(size=(3, 12, 13)), rng.normal(size=(3, 12, 13))
+    if steady:  # the drift's and the noise's own terms alone, where v does not change
+        values, rates = np.broadcast_to(values[:1], values.shape).copy(), np.zeros_like(rates)
     steps = np.array([0.3, 0.2])
     bound = residual_bound(generator, values, rates, steps)
     points, t = points_in(axes, rng), rng.uniform(0, 1, 4000)
