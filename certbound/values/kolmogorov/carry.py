@@ -11,7 +11,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from certbound.values.kolmogorov.box_setting import Setting
 from certbound.values.kolmogorov.face_exits import face_of, shortfall
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.solve import Discretised, discretised
+from certbound.values.kolmogorov.sources import BREADTHS, at_knots, at_nodes
 from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
@@ -32,6 +32,7 @@ _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e live
 _SOFT = 3.0
 _KILL = 10.0
 _REACHED = 1.5
+_ON_FACE = 0.3  # of the source that would raise e to what v lacks while a path crosses one cell
 _BATCH = 20000
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
@@ -56,7 +57,10 @@ def time_steps(horizon: float, count: int, layer: float) -> Array:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Mesh:
-    """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis)."""
+    """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis).
+
+    ``leaving`` is the rate at which paths leave the cells about a node.
+    """
 
     nodes: tuple[Array, ...]
     pad: tuple[tuple[int, int], ...]
@@ -64,6 +68,7 @@ class Mesh:
     layer: Array
     at_limit: Mask
     rate: Array
+    leaving: Array
 
 
 def extended(nodes: Array, before: int, behind: int) -> Array:
@@ -117,7 +122,16 @@ def mesh_of(
             rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(flow[one.axis] / (_SOFT * one.speed))
     layer[dead] = 0
     equation = discretised(lines, flow, spread, dead, rate)
-    return Mesh(nodes=lines, pad=pads, equation=equation, layer=layer, at_limit=at_limit, rate=rate)
+    return Mesh(nodes=lines, pad=pads, equation=equation, layer=layer, at_limit=at_limit, rate=rate,
+                leaving=_leaving(lines, flow, spread))  # fmt: skip
+
+
+def _leaving(lines: tuple[Array, ...], flow: Array, spread: Array) -> Array:
+    rate = np.zeros(flow.shape[1:])
+    for i, line in enumerate(lines):
+        width = np.gradient(line).reshape([-1 if k == i else 1 for k in range(len(lines))])
+        rate += np.abs(flow[i]) / width + spread[i, i] / width**2
+    return rate
 
 
 def _bump(y: Array) -> Array:
@@ -171,6 +185,7 @@ class Side:
             face_of(self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])))
             for i in range(n) for side in (0, 1)
         ]
+        self.passes = 0
         self.values: list[Array] = []
         self.rates: list[Array] = []
 
@@ -243,45 +258,44 @@ class Side:
 
     def correct(self, residuals: list[Array]) -> None:
         """Solve for the error that the residuals leave, and for what v lacks at exits and at the end; add it to v."""
-        equation = self.carrier.equation
-        slabs = [self._spread(r) + b for r, b in zip(residuals, self._at_exits())]
-        ends = [slabs[0], *(np.maximum(p, q) for p, q in pairwise(slabs)), slabs[-1]]
-        ends = [(1 + _MARGIN) * s * equation.live for s in ends]
-        missing = (1 + _MARGIN) * self._spread(self.shortfall_at_end()) * equation.live
+        equation, breadth = self.carrier.equation, min(self.passes, len(BREADTHS) - 1)
+        spread = partial(at_nodes, pads=self.carrier.pad, breadth=BREADTHS[breadth])
+        slabs = [spread(r) + b for r, b in zip(residuals, self._at_exits(spread))]
+        ends = [(1 + _MARGIN) * s * equation.live for s in at_knots(slabs, self.steps, BREADTHS[breadth])]
+        missing = (1 + _MARGIN) * spread(self.shortfall_at_end()) * equation.live
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
         self._add(0, e, equation.speed(e, ends[0]))
         for k, step in enumerate(self.steps):
             e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
             self._add(k + 1, e, equation.speed(e, ends[k + 1]))
+        self.passes += 1
 
-    def _at_exits(self) -> list[Array]:
-        """Sources beyond the faces, from which e takes what v lacks there, slab by slab."""
-        total = [np.zeros(self.carrier.equation.shape) for _ in self.steps]
+    def _at_exits(self, spread: Callable[..., Array]) -> list[Array]:
+        """Sources beyond the faces and on them, from which e takes what v lacks there, slab by slab.
+
+        Beyond a face e is killed at a rate, and held near what v lacks by as large a source. Paths that graze a
+        noise-free face hardly get there: a source on the face itself raises e while they are about it.
+        """
+        carrier = self.carrier
+        total = [np.zeros(carrier.equation.shape) for _ in self.steps]
         for face, missing in zip(self.faces, self.shortfalls()):
-            pad = self.carrier.pad[face.axis][face.side]
-            if not pad or not missing.any():
+            pad = carrier.pad[face.axis][face.side]
+            if not missing.any():
                 continue
-            length = self.carrier.equation.shape[face.axis]
+            length = carrier.equation.shape[face.axis]
             beyond = slice(length - pad, length) if face.side else slice(0, pad)
-            place = tuple(beyond if k == face.axis else slice(None) for k in range(len(self.axes)))
+            at = slice(length - pad - 1, length - pad) if face.side else slice(pad, pad + 1)
+            place, on = (
+                tuple(part if k == face.axis else slice(None) for k in range(len(self.axes))) for part in (beyond, at)
+            )
             for k, one in enumerate(missing):
                 if one.any():
-                    around = self._spread(np.expand_dims(one, face.axis), skip=face.axis)
-                    total[k][place] = np.maximum(total[k][place], _REACHED * around * self.carrier.rate[place])
+                    around = spread(np.expand_dims(one, face.axis), skip=face.axis)
+                    total[k][place] = np.maximum(total[k][place], _REACHED * around * carrier.rate[place])
+                    if not self.setting.noisy[face.axis]:
+                        total[k][on] = np.maximum(total[k][on], _ON_FACE * around * carrier.leaving[on])
         return total
 
     def _add(self, k: int, e: Array, speed: Array) -> None:
         self.values[k] = self.values[k] + apply_dense(self.carried_maps, e)
         self.rates[k] = self.rates[k] - apply_dense(self.carried_maps, speed)
-
-    def _spread(self, cells: Array, skip: int | None = None) -> Array:
-        """A smooth source on the carrier's nodes above what is asked for on the cells."""
-        from scipy.ndimage import maximum_filter, uniform_filter
-
-        for axis, (before, behind) in enumerate(self.carrier.pad):
-            if axis != skip:
-                around = [(before + 1, behind + 1) if k == axis else (0, 0) for k in range(cells.ndim)]
-                moved = np.moveaxis(np.pad(cells, around), axis, 0)
-                cells = np.moveaxis(np.maximum(moved[1:], moved[:-1]), 0, axis)
-        size = [1 if axis == skip else 3 for axis in range(cells.ndim)]
-        return np.asarray(uniform_filter(maximum_filter(cells, size), size))

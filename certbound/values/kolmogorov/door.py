@@ -19,7 +19,7 @@ from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
 from certbound.watch import poll
 
 _COARSEST = {2: 0.06, 3: 0.07}  # cell of the first grid, as a share of the range
-_STEPS = 2.4  # cells of the range a step: errors in space and in time are about alike then
+_STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
 _PASSES, _USUAL = 8, 5  # at most, and in most cases
 _CLOSE = 1.01  # ratio of the bounds that ends the search
 _PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
