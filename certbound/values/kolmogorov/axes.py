@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ _FINE = 100001  # points on which an axis is planned
 _ALONG = 41  # points along each axis of a face
 _BEYOND, _WIDEST = 0.35, 4.0  # growth of cells beyond the range, and their largest size there
 _TO_LIMIT, _TO_FREE, _ABOUT = 0.25, 0.3, 0.12  # growth away from noisy limits, noise-free limits, grazing points
+_TYPICAL = 0.35  # of the speed at one cell's distance from a grazing point: that of what is killed there
 _LAYER = 3.0  # cells are at most a / (this |f|) at a limit
 _SMALLEST = 0.15  # of an inner cell, at noisy limits
 
@@ -36,16 +37,21 @@ class Grazing:
     scale: float
 
 
-def plan_axes(setting: Setting, cell: Array, row: int) -> tuple[list[Array], list[Grazing]]:
+def plan_axes(
+    setting: Setting, cell: Array, row: int, shapes: Sequence[Size] = ()
+) -> tuple[list[Array], list[Grazing]]:  # fmt: skip
     """Nodes of each axis, and where paths graze.
 
     ``cell`` holds a share of the range for each axis; ``row`` says which ends of the box are meant (0: the inner ones).
+    With ``shapes``, a width at every place of each axis, cells follow these but where paths graze.
     """
     low, high = setting.low[row], setting.high[row]
     width = setting.range[1] - setting.range[0]
     cell = np.broadcast_to(cell, width.shape)
     n = setting.dimension
     sizes: list[list[Size]] = [[_inner(cell[i] * width[i], *setting.range[:, i])] for i in range(n)]
+    if shapes:
+        sizes = [[shape] for shape in shapes]
     grazing: list[Grazing] = []
     for i in range(n):
         for side, place in enumerate((low[i], high[i])):
@@ -53,9 +59,9 @@ def plan_axes(setting: Setting, cell: Array, row: int) -> tuple[list[Array], lis
                 continue
             points = _face(setting, low, high, i, place)
             f, a = setting.flow(points)[i], setting.spread(points).reshape(n, n, *points.shape[1:])
-            if setting.noisy[i]:
+            if setting.noisy[i] and not shapes:
                 sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
-            else:
+            elif not setting.noisy[i]:
                 grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place)
     return [_nodes(low[i], high[i], sizes[i]) for i in range(n)], grazing
 
@@ -100,7 +106,7 @@ def _graze(
             slopes[k] = (setting.flow(moved)[axis] - setting.flow(chosen)[axis]) / (1e-5 * cells[k])
     mean = np.abs(slopes).mean(axis=1)
     noise = float(np.mean(np.einsum("ip,ijp,jp->p", slopes, a[:, :, near], slopes)))
-    speed = 0.5 * float(np.max(mean * cells))
+    speed = _TYPICAL * float(np.max(mean * cells))
     if speed <= 0:
         return []
     scale = float(np.clip(speed**3 / max(noise, 1e-300), 1e-6 * cells[axis], 0.5 * cells[axis]))

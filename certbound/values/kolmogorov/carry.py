@@ -7,7 +7,7 @@ below -1 at limits and 0 at other ends of the box), and v(T) >= 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -16,10 +16,10 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.rigor.intervals import Interval
-from certbound.values.kolmogorov.axes import Grazing, plan_axes
+from certbound.values.kolmogorov.axes import Grazing, Size, plan_axes
 from certbound.values.kolmogorov.box_setting import Setting
 from certbound.values.kolmogorov.face_exits import face_of, shortfall
-from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
+from certbound.values.kolmogorov.slab_residual import Generator, residual_bound, rough_residual
 from certbound.values.kolmogorov.solve import Discretised, discretised
 from certbound.values.kolmogorov.sources import BREADTHS, at_knots, at_nodes
 from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
@@ -33,7 +33,8 @@ _SOFT = 3.0
 _KILL = 10.0
 _REACHED = 1.5
 _ON_FACE = 0.3  # of the source that would raise e to what v lacks while a path crosses one cell
-_BATCH = 20000
+_BATCH = 300_000  # lattice points of the slabs that are looked at together
+_SKETCH = 2  # points along each axis of a cell, where nothing is proved of its residual
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
 
@@ -79,7 +80,12 @@ def extended(nodes: Array, before: int, behind: int) -> Array:
 
 
 def mesh_of(
-    setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool,
+    setting: Setting,
+    nodes: list[Array],
+    grazing: list[Grazing],
+    row: int,
+    pad: tuple[int, int],
+    kill: bool,
     span: float,
 ) -> Mesh:
     """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones."""
@@ -150,6 +156,11 @@ def _later(given: Callable[[float], Array | float], begin: float, step: float, p
     return given(begin + part * step)
 
 
+def _generator(setting: Setting, axes: tuple[Axis, ...]) -> Generator:
+    always = Interval.point(0.0)
+    return Generator.of(axes, setting.drift.on(axes, always), setting.square.on(axes, always))
+
+
 class Side:
     """One bound on one grid.
 
@@ -162,32 +173,46 @@ class Side:
         Steps over the horizon.
     above : bool
         From above or from below.
+    shapes : sequence of callable, optional
+        A width at every place of each axis; without them cells follow the scales of the equation.
     """
 
-    def __init__(self, setting: Setting, cell: Array, steps: int, above: bool, parts: int | None = None) -> None:
-        self.setting, self.above = setting, above
+    def __init__(
+        self, setting: Setting, cell: Array, steps: int, above: bool, shapes: Sequence[Size] = (),
+        parts: int = 4,
+    ) -> None:  # fmt: skip
+        self.setting, self.above, self.cell, self.count = setting, above, cell, steps
         row = 0 if above else 1
         self.layer = END * float(np.mean(cell)) * setting.horizon
-        nodes, grazing = plan_axes(setting, cell, row)
-        self.axes = tuple(Axis(line, Sampling(parts or (4 if len(nodes) < 3 else 2))) for line in nodes)
+        nodes, grazing = plan_axes(setting, cell, row, shapes)
+        self.axes = tuple(Axis(line, Sampling(parts)) for line in nodes)
         self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer)
         self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer)
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
         self.steps = time_steps(setting.horizon * longer, steps, self.layer)
-        everywhere = Interval.point(0.0)
-        self.generator = Generator.of(
-            self.axes, setting.drift.on(self.axes, everywhere), setting.square.on(self.axes, everywhere)
+        self.generator, self.sketch = (
+            _generator(setting, axes) for axes in (self.axes, tuple(Axis(line, Sampling(_SKETCH)) for line in nodes))
         )
         self.maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.mesh.nodes)]
         self.carried_maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.carrier.nodes)]
         n, noisy = setting.dimension, setting.noisy
         self.faces = [
             face_of(self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])))
-            for i in range(n) for side in (0, 1)
+            for i in range(n)
+            for side in (0, 1)
         ]
         self.passes = 0
         self.values: list[Array] = []
         self.rates: list[Array] = []
+
+    def on(self, shapes: Sequence[Size]) -> Side:
+        """The same side on axes of other shapes."""
+        return Side(self.setting, self.cell, self.count, self.above, shapes)
+
+    @property
+    def begun(self) -> bool:
+        """Whether the next source is still about the residual, and not above it."""
+        return self.passes < len(BREADTHS) - 1
 
     @property
     def work(self) -> int:
@@ -234,17 +259,19 @@ class Side:
         self.values.append(sign * (apply_dense(self.maps, a) - 1))
         self.rates.append(-sign * apply_dense(self.maps, speed))
 
-    def residuals(self) -> list[Array]:
-        """A bound of v_t + L v on every cell, slab by slab from the end backward."""
-        many = max(1, _BATCH * len(self.steps) // self.work)
+    def residuals(self, rough: bool = False) -> list[Array]:
+        """A bound of v_t + L v on every cell, slab by slab from the end backward; ``rough`` about that, and quicker."""
+        generator = self.sketch if rough else self.generator
+        lattice = int(np.prod([axis.sampling.parts for axis in generator.axes]))
+        many = max(1, _BATCH * len(self.steps) // (lattice * self.work))
         with ThreadPoolExecutor(2) as pool:
-            parts = pool.map(lambda begin: self._bounded(begin, begin + many), range(0, len(self.steps), many))
+            parts = pool.map(lambda k: self._bounded(generator, rough, k, k + many), range(0, len(self.steps), many))
             return [bound for part in parts for bound in part]
 
-    def _bounded(self, begin: int, end: int) -> list[Array]:
+    def _bounded(self, generator: Generator, rough: bool, begin: int, end: int) -> list[Array]:
         steps = self.steps[begin:end]
         values, rates = (np.array(rows[begin : begin + len(steps) + 1]) for rows in (self.values, self.rates))
-        bound = residual_bound(self.generator, values, rates, steps)
+        bound = (rough_residual if rough else residual_bound)(generator, values, rates, steps)
         return list(np.where(self._decided(values, rates, steps), 0.0, np.maximum(bound, 0.0)))
 
     def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:

@@ -15,12 +15,15 @@ from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.values.kolmogorov.box_setting import Setting, setting_of
 from certbound.values.kolmogorov.carry import Side
+from certbound.values.kolmogorov.shares import Shape, better_shapes
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
 from certbound.watch import poll
 
-_COARSEST = {2: 0.06, 3: 0.07}  # cell of the first grid, as a share of the range
+_COARSEST = {2: 0.06, 3: 0.1}  # cell of the first grid, as a share of the range
 _STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
-_PASSES, _USUAL = 8, 5  # at most, and in most cases
+_PASSES, _USUAL = 12, 5  # at most, and in most cases in units of one that proves
+_ROUGH = 0.3  # what a pass takes where nothing is proved
+_ROUNDS = 2  # grids whose axes are improved, before the first one on which anything is proved
 _CLOSE = 1.01  # ratio of the bounds that ends the search
 _PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
 _GROWTH = 6.0  # the largest factor of work from one grid to the next
@@ -28,7 +31,7 @@ _LEAST = 1.5  # the smallest one that is worth it
 _SHARE, _ORDER = 0.8, 2.0  # of what the target leaves, that an error may take; how fast errors fall with cells
 _FAR = 2.0  # ratio of the coarsest solution to the target, beyond which it says which bound decides
 _STARTS = 9  # points along each side of a start set
-RATE = {2: 1.5e5, 3: 1.0e5}
+RATE = {2: 1.8e5, 3: 7.0e4}
 """Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
 
 
@@ -92,10 +95,11 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     budget = seconds * RATE[setting.dimension]
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
     sides: tuple[bool, ...] = (True, False)
+    shapes: dict[bool, Shapes] = {}
     while True:
         before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
-            side = Side(setting, np.full(setting.dimension, cell), count, above)
+            side = Side(setting, np.full(setting.dimension, cell), count, above, _scaled(shapes.get(above), cell))
             cells = cells_of(side.axes)
             if not work and len(sides) * _USUAL * side.work > budget:
                 yield Bounds(lower=0.0, upper=1.0, cells=cells, steps=count, runs=0, estimate=math.nan, work=0.0)
@@ -104,9 +108,15 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
             estimate = abs(largest_at_start(side, starts)[0])
             if above and len(sides) > 1 and estimate > _FAR * delta > 0:
                 continue
+            rounds = 0 if above in shapes else _ROUNDS
+            side, residuals = adapted(side, starts, rounds)
+            cells, estimate = cells_of(side.axes), abs(largest_at_start(side, starts)[0])
             last = (1 + _LEAST) * _USUAL * side.work > budget - work
-            bound, value, passes = refined(side, starts, math.inf if last or not delta else delta if above else -delta)
-            work += passes * side.work
+            target = math.inf if last or not delta else delta if above else -delta
+            if side.finite:
+                shapes[above] = (cell, better_shapes(side, residuals, starts.points))
+            bound, value, passes = refined(side, starts, target, residuals)
+            work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
             lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
             yield Bounds(lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work)
             if upper <= max(_CLOSE * lower, delta) or lower > delta > 0:
@@ -126,26 +136,53 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
         cell /= growth ** (1 / (setting.dimension + 1))
 
 
-def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float, float, int]:
+Shapes = tuple[float, list[Shape]]
+"""The cell of a grid, and the widths that are better for as many cells."""
+
+
+def _scaled(shapes: Shapes | None, cell: float) -> list[Shape]:
+    return [] if shapes is None else [shape.scaled(cell / shapes[0]) for shape in shapes[1]]
+
+
+def adapted(side: Side, starts: Starts, rounds: int) -> tuple[Side, list[Array]]:
+    """A grid of about as many cells that is better for this problem, and about its residuals."""
+    while side.finite:
+        residuals = side.residuals(rough=True)
+        if not rounds:
+            return side, residuals
+        side = side.on(better_shapes(side, residuals, starts.points))
+        side.propose()
+        rounds -= 1
+    return side, []
+
+
+def refined(
+    side: Side, starts: Starts, target: float = math.inf, residuals: list[Array] | None = None
+) -> tuple[float, float, float]:  # fmt: skip
     """The bound of one side: passes of the carried error until what is left of the residual is paid.
 
-    Passes end early once v at the start, which only grows, is beyond ``target``. The bound, v there, and their number.
+    Passes end early once v at the start, which only grows, is beyond ``target``; the first ``residuals`` may be known.
+    The bound, v there, and what it took in passes.
     """
-    best, passes = math.inf, 0
+    best, passes = math.inf, 0.0
     while True:
-        passes += 1
         poll("solving for the error that is left")
         if not side.finite:
             return best, math.inf, passes
-        residuals = side.residuals()
-        left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
-        missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
-        value = largest_at_start(side, starts)[1]
-        best = min(best, value + (left + missing) * (1 + 1e-9) + 1e-15)
-        paid, hopeless = left + missing <= _PAID * abs(value), value >= min(1.0 if side.above else 0.0, target)
-        if paid or hopeless or passes == _PASSES:
+        rough, value = side.begun, largest_at_start(side, starts)[1]
+        paid, hopeless = False, value >= min(1.0 if side.above else 0.0, target)
+        if residuals is None:
+            residuals = side.residuals(rough)
+            passes += _ROUGH if rough else 1.0
+        if not rough:
+            left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
+            missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
+            best = min(best, value + (left + missing) * (1 + 1e-9) + 1e-15)
+            paid = left + missing <= _PAID * abs(value)
+        if paid or hopeless or side.passes == _PASSES:
             return best, value, passes
         side.correct(residuals)
+        residuals = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -20,7 +20,7 @@ and d_i^(m+1) r_j is bounded term by term: d^(m+1) (F D) = sum_k binomial(m + 1,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import comb
 from typing import Any
@@ -37,6 +37,7 @@ from certbound.values.kolmogorov.splines import (
     amplified,
     most_of_interpolants,
     outer,
+    over_cells,
     plus,
     unit,
 )
@@ -150,22 +151,33 @@ def residual_bound(generator: Generator, values: Array, rates: Array, steps: Arr
     ndarray, shape (K, N_1, ...)
     """
     axes = generator.axes
-    n = len(axes)
-    h = steps.reshape(-1, *[1] * n)
+    h = steps.reshape(-1, *[1] * len(axes))
+    bound = np.full((len(steps), *(axis.cells for axis in axes)), -np.inf)
+    for residual in _in_time(generator, values, rates, h):
+        bound = np.maximum(bound, most_of_interpolants(axes, residual))
+    sizes, speeds = _sizes(axes, values, rates, h)
+    extra = generator.remainder(sizes, speeds) + generator.roundoff(sizes, speeds, h)
+    return np.asarray(bound + extra * _UP)
+
+
+def rough_residual(generator: Generator, values: Array, rates: Array, steps: Array) -> Array:
+    """About the same, from values at lattice points alone: nothing is proved of it."""
+    h = steps.reshape(-1, *[1] * len(generator.axes))
+    parts = [over_cells(generator.axes, residual) for residual in _in_time(generator, values, rates, h)]
+    return np.asarray(np.maximum.reduce(parts))
+
+
+def _in_time(generator: Generator, values: Array, rates: Array, h: Array) -> Iterator[Array]:
+    """The Bernstein coefficients in time of v_t + L v, at the lattice points."""
     value, image = generator.on_lattice(values)
     rate, image_of_rate = generator.on_lattice(rates)
     late, early = slice(None, -1), slice(1, None)
     # m = 3 (b_2 - b_1) / h; the raised coefficients of v_t are D_k, (D_k + 2 m) / 3, (2 m + D_{k+1}) / 3, D_{k+1}
     middle = 2 * (value[late] - value[early]) / h - (2 / 3) * (rate[early] + rate[late])
-    bound = np.full((len(steps), *(axis.cells for axis in axes)), -np.inf)
-    for residual in (
-        rate[early] + image[early], rate[early] / 3 + middle + (image[early] + h / 3 * image_of_rate[early]),
-        middle + rate[late] / 3 + (image[late] - h / 3 * image_of_rate[late]), rate[late] + image[late],
-    ):  # fmt: skip
-        bound = np.maximum(bound, most_of_interpolants(axes, residual))
-    sizes, speeds = _sizes(axes, values, rates, h)
-    extra = generator.remainder(sizes, speeds) + generator.roundoff(sizes, speeds, h)
-    return np.asarray(bound + extra * _UP)
+    yield rate[early] + image[early]
+    yield rate[early] / 3 + middle + (image[early] + h / 3 * image_of_rate[early])
+    yield middle + rate[late] / 3 + (image[late] - h / 3 * image_of_rate[late])
+    yield rate[late] + image[late]
 
 
 def _sizes(axes: tuple[Axis, ...], values: Array, rates: Array, h: Array) -> tuple[Sizes, Sizes]:

@@ -7,6 +7,7 @@ Alexander's third-order L-stable one (Alexander 1977, three stages).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -141,11 +142,20 @@ class Equation:
 
     def solve(self, share: float, values: Array) -> Array:
         """(1 - share L)^-1 values."""
+        solution: Array = self._factored(share).solve(values.ravel())
+        return solution.reshape(self.shape)
+
+    def adjoint(self, share: float, values: Array) -> Array:
+        """The same with the transposed matrix: where paths from ``values`` are after a time ``share``."""
+        solve: Any = self._factored(share).solve  # SciPy's types leave the second argument out
+        return np.asarray(solve(values.ravel(), "T")).reshape(self.shape)
+
+    def _factored(self, share: float) -> sl.SuperLU:
         key = float(np.format_float_positional(share, precision=9, unique=False, fractional=False))
         if key not in self.inverses:
             size = self.matrix.shape[0]
             self.inverses[key] = sl.splu((sp.identity(size) - key * self.matrix).tocsc(), permc_spec="COLAMD")
-        return self.inverses[key].solve(values.ravel()).reshape(self.shape)
+        return self.inverses[key]
 
     def step(self, values: Array, step: float, source: Source, given: Source) -> Array:
         """One step backward in time."""
@@ -215,6 +225,12 @@ class SplitEquation:
             values = solve_along(values, axis, share * ahead, share * behind)
         return values
 
+    def adjoint(self, share: float, values: Array) -> Array:
+        """The same with the transposed factors: where paths from ``values`` are after a time ``share``."""
+        for axis in reversed(range(len(self.nodes))):
+            values = solve_along(values, axis, share * self.ahead[axis], share * self.behind[axis], transposed=True)
+        return values / (1 + share * self.rate)
+
     def step(self, values: Array, step: float, source: Source, given: Source) -> Array:
         """One step backward in time."""
         stages: list[Array] = []
@@ -268,10 +284,32 @@ def _thomas(values, ahead, behind):  # type: ignore[no-untyped-def]
                 values[p, j, q] += ratio[j, q] * values[p, j + 1, q]
 
 
-def solve_along(values: Array, axis: int, ahead: Array, behind: Array) -> Array:
+@compiled
+def _thomas_transposed(values, ahead, behind):  # type: ignore[no-untyped-def]
+    """The same with the transposed matrix."""
+    count, width = values.shape[1], values.shape[2]
+    ratio, scale = np.empty((count, width)), np.empty((count, width))
+    for p in range(values.shape[0]):
+        for j in range(count):
+            for q in range(width):
+                up, low = ahead[p, j, q], behind[p, j, q]
+                if j == 0:
+                    scale[j, q] = 1.0 / (1.0 + up)
+                else:
+                    scale[j, q] = 1.0 / (1.0 + up + low - low * ratio[j - 1, q])
+                    values[p, j, q] += ratio[j - 1, q] * values[p, j - 1, q]
+                ratio[j, q] = up * scale[j, q]
+        for j in range(count - 1, -1, -1):
+            for q in range(width):
+                if j < count - 1:
+                    values[p, j, q] += behind[p, j + 1, q] * values[p, j + 1, q]
+                values[p, j, q] *= scale[j, q]
+
+
+def solve_along(values: Array, axis: int, ahead: Array, behind: Array, *, transposed: bool = False) -> Array:
     """Solve tridiagonal systems along an axis (`_thomas`)."""
     given = thin(values.copy(), axis)
-    _thomas(given, thin(ahead, axis), thin(behind, axis))
+    (_thomas_transposed if transposed else _thomas)(given, thin(ahead, axis), thin(behind, axis))
     return back(given, values.shape, axis)
 
 
