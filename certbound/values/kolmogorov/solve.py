@@ -46,7 +46,8 @@ _STAGE, _MIXED, _WEIGHTS, _SHARES = _method()
 
 Stencils = Sequence[tuple[int, int]]
 DRIFT: Stencils = ((-2, 3), (-1, 2))
-"""Upwind, where the drift is positive: of fifth order, of third where that does not fit or no noise smooths."""
+"""Upwind, where the drift is positive: of fifth order, of third where that does not fit or little noise smooths."""
+_PECLET = 10.0  # of drift times width to squared noise, beyond which differences of fifth order may grow
 NOISE: Stencils = ((-3, 3), (-2, 2))
 _CENTRAL: Stencils = ((-2, 2),)
 
@@ -96,7 +97,7 @@ def difference(nodes: Array, stencils: Stencils, order: int) -> sp.csr_array:
 
 
 def upwind(nodes: Array, smooth: bool) -> tuple[sp.csr_array, sp.csr_array]:
-    """First derivatives for positive and for negative drift; ``smooth`` where noise moves this coordinate."""
+    """First derivatives for positive and for negative drift; ``smooth`` where noise smooths over a cell."""
     stencils = DRIFT if smooth else DRIFT[-1:]
     return difference(nodes, stencils, 1), difference(nodes, [(-last, -first) for first, last in stencils], 1)
 
@@ -120,8 +121,13 @@ class Equation:
         size = int(np.prod(self.shape))
         total = sp.csr_array((size, size))
         for i in range(len(nodes)):
-            up, down = (self._on(i, one) for one in upwind(nodes[i], bool(spread[i, i].any())))
-            total = total + _diagonal(np.maximum(flow[i], 0)) @ up + _diagonal(np.minimum(flow[i], 0)) @ down
+            width = np.gradient(nodes[i]).reshape([-1 if k == i else 1 for k in range(len(nodes))])
+            smooth = np.abs(flow[i]) * width <= _PECLET * spread[i, i]
+            for there, order in ((smooth, True), (~smooth, False)):
+                if there.any():
+                    up, down = (self._on(i, one) for one in upwind(nodes[i], order))
+                    total = total + _diagonal(there * np.maximum(flow[i], 0)) @ up
+                    total = total + _diagonal(there * np.minimum(flow[i], 0)) @ down
             if spread[i, i].any():
                 total = total + _diagonal(spread[i, i] / 2) @ self._on(i, difference(nodes[i], NOISE, 2))
             for j in range(i):
