@@ -23,6 +23,7 @@ from certbound.values.kolmogorov.face_exits import face_of, shortfall
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.solve import Discretised, discretised
 from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
+from certbound.values.kolmogorov.witness import Witness
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
@@ -173,6 +174,7 @@ class Side:
         ]
         self.values: list[Array] = []
         self.rates: list[Array] = []
+        self.witness: Witness | None = None
 
     @property
     def work(self) -> int:
@@ -195,6 +197,10 @@ class Side:
     def shortfall_at_end(self) -> Array:
         """What v(T) lacks of 0 on every cell."""
         return np.asarray(np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0))
+
+    def lacking(self) -> float:
+        """The most that v lacks at the end and at faces where paths can leave."""
+        return max(float(self.shortfall_at_end().max()), *(float(missing.max()) for missing in self.shortfalls()))
 
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""

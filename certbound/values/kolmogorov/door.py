@@ -16,6 +16,7 @@ from certbound.problem.sets import GaussianStart
 from certbound.values.kolmogorov.box_setting import Setting, setting_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
+from certbound.values.kolmogorov.witness import Witness
 from certbound.watch import poll
 
 _COARSEST = {2: 0.06, 3: 0.07}  # cell of the first grid, as a share of the range
@@ -48,6 +49,8 @@ class Bounds:
         The probability by the numerical solution; nothing is proved of it.
     work : float
         Cells of space and time that passes went over.
+    witnesses : tuple of Witness
+        What proves the bounds, from coarse to fine: for certificates.
     """
 
     lower: float
@@ -57,6 +60,7 @@ class Bounds:
     runs: int
     estimate: float
     work: float
+    witnesses: tuple[Witness, ...] = ()
 
 
 def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0) -> Iterator[Bounds]:
@@ -92,6 +96,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     budget = seconds * RATE[setting.dimension]
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
     sides: tuple[bool, ...] = (True, False)
+    kept: tuple[Witness, ...] = ()
     while True:
         before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
@@ -107,8 +112,12 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
             last = (1 + _LEAST) * _USUAL * side.work > budget - work
             bound, value, passes = refined(side, starts, math.inf if last or not delta else delta if above else -delta)
             work += passes * side.work
+            kept += () if side.witness is None else (side.witness,)
             lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
-            yield Bounds(lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work)
+            yield Bounds(
+                lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work,
+                witnesses=kept,
+            )  # fmt: skip
             if upper <= max(_CLOSE * lower, delta) or lower > delta > 0:
                 return
             if above and _FAR * estimate < delta:
@@ -139,9 +148,11 @@ def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float
             return best, math.inf, passes
         residuals = side.residuals()
         left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
-        missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
+        missing = side.lacking()
         value = largest_at_start(side, starts)[1]
-        best = min(best, value + (left + missing) * (1 + 1e-9) + 1e-15)
+        bound = value + (left + missing) * (1 + 1e-9) + 1e-15
+        if bound < best:
+            best, side.witness = bound, Witness.of(side, value, bound)
         paid, hopeless = left + missing <= _PAID * abs(value), value >= min(1.0 if side.above else 0.0, target)
         if paid or hopeless or passes == _PASSES:
             return best, value, passes
