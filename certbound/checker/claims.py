@@ -397,7 +397,8 @@ ENGINES = {
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
     "backward": Engine(
-        words="a solution of the backward equation, its error included (Thm K10)", prove=_backward, below=_backward_below
+        words="a solution of the backward equation, its error included (Thm K10)", prove=_backward,
+        below=_backward_below,
     ),
     "lasting": Engine(words="a function of the state alone", prove=check_lasting, below=check_lasting_below),
     "rate": Engine(words="how fast paths leave", prove=check_leaving, below=check_leaving_below),

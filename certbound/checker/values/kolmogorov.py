@@ -14,14 +14,15 @@ Then, P being the probability of failing (theory.md, section 15),
 
     P <= v(0, x) + gamma + sum_k eta_k h_k     (above),     P >= -v(0, x) - gamma - sum_k eta_k h_k     (below).
 
-On a patch v_t + L v is a cubic in time whose Bernstein coefficients are v_t's and L b_j. Of f and a Taylor models about
-the patch's middle are made; their polynomials times those of v's derivatives are polynomials of degree 5 + d in every
-xi, which lie below the largest of their Bernstein coefficients. What the models miss is paid by the size of the
-derivatives. Where that does not show what the file states as ``eta``, the patch is cut; eta is what is found in the end.
+On a patch v_t + L v is a cubic in time whose Bernstein coefficients are v_t's and L b_j. Of f and a Taylor models
+about the patch's middle are made; their polynomials times those of v's derivatives are polynomials of degree 5 + d in
+every xi, which lie below the largest of their Bernstein coefficients. What the models miss is paid by the size of the
+derivatives. Where that does not show what the file states as ``eta``, the patch is cut; eta is what is found at last.
 
-Roundings. An entry of the derivative of orders alpha of b_j, by powers of xi, is off by at most `splines.ROUNDED` times
-the size times prod_i (2 / h_i)^alpha_i binomial (5, k_i) k_i!/(k_i - alpha_i)!, whose sums over k are ``_SUMS``. The sum
-of all products, and the matrices to Bernstein's form, whose entries are at most 1, add a rounding for each term of a sum.
+Roundings. An entry of the derivative of orders alpha of b_j, by powers of xi, is off by at most `splines.ROUNDED`
+times the size times prod_i (2 / h_i)^alpha_i binomial (5, k_i) k_i!/(k_i - alpha_i)!, whose sums over k are ``_SUMS``.
+The sum of all products, and the matrices to Bernstein's form, whose entries are at most 1, add a rounding for each
+term of a sum.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from flint import arb
@@ -102,9 +104,7 @@ class _Solution:
 
     def bound(self) -> arb:
         """At least the probability of failing from any start, or (lower) at most that from one of the stated ones."""
-        limits = SafeSet(self.model, bounded=False)
-        if self.above and not limits.holds(*_about(self.sides)):
-            raise Unproved("the grid was not shown to lie in the safe set")
+        limits = self._limits()
         start = self._at_starts()
         gamma = max([0.0, -self._at_end(), *(self._lacking(limits, *face) for face in self._faces())])
         if not math.isfinite(gamma):
@@ -117,6 +117,19 @@ class _Solution:
         return arb.max(arb.min(found, arb(1)), arb(0)).upper() if self.above else arb.max(found, arb(0)).lower()
 
     # ---- the box, the faces, the end, the starts ------------------------------------------------------------------
+
+    def _limits(self) -> SafeSet:
+        """The safe set, which from above holds the box, and the starts touch no obstacle."""
+        model = self.model
+        always = [c.during is not None and c.during[0] <= 0 and c.during[1] >= model.horizon for c in model.constraints]
+        asked = (replace(c, during=None) if all_ else c for c, all_ in zip(model.constraints, always))
+        limits = SafeSet(replace(model, constraints=tuple(asked)), bounded=False)
+        if self.above and not limits.holds(*_about(self.sides)):
+            raise Unproved("the grid was not shown to lie in the safe set")
+        starts = list(zip(model.initial.low, model.initial.high))
+        if self.above and not limits.holds(*_about(starts), strictly=True):
+            raise Unproved("the initial set was not shown to lie in the safe set")
+        return limits
 
     def _is_noisy(self, i: int) -> bool:
         """Whether noise may move a state."""
@@ -186,6 +199,7 @@ class _Solution:
         """At least v(0, .) on a box of starts."""
         if not all(low >= a and high <= b for (a, b), (low, high) in zip(self.sides, box)):
             raise Unproved("a start was not shown to lie in the grid")
+        self.budget.floats(4 * sum(map(len, self.splines.axes)), 8)
         ends = [(below(low), above(high)) for low, high in box]
         met = [np.flatnonzero((axis[:-1] <= b) & (axis[1:] >= a)) for axis, (a, b) in zip(self.splines.axes, ends)]
         count, most = math.prod(map(len, met)), -np.inf
@@ -204,17 +218,15 @@ class _Solution:
         for axis, (place, (a, b)) in enumerate(zip(places, ends)):
             row = self.splines.axes[axis]
             width = row[place + 1] - row[place]
-            off = 2.0**-48 * (1 + np.maximum(np.abs(row[place]), np.abs(row[place + 1])) / width)
             low, high = (np.clip(2 * (end - row[place]) / width - 1, -1, 1) for end in (a, b))
-            middle, half = (low + high) / 2, (high - low) / 2 + off
+            middle, half = (low + high) / 2, (high - low) / 2 + 2.0**-48  # a dozen roundings of numbers up to 2
             shifted = np.zeros((DEGREE + 1, DEGREE + 1, len(place)))
             for k, j in itertools.combinations_with_replacement(range(DEGREE + 1), 2):
                 shifted[k, j] = math.comb(j, k) * middle ** (j - k) * half**k
             matrix = np.einsum("ik,kjp->ijp", bernstein(DEGREE), shifted)
             out = letters.replace(letters[axis], "j")
             table = np.einsum(f"j{letters[axis]}p,{letters}p->{out}p", matrix, table)
-        reach = np.prod([1 + half_off for half_off in [2.0**-40] * self.n]) * _SUMS[0] ** self.n
-        slack = 8 * ROUNDED * reach * patches.size + _UNIT * np.abs(patches.constants[0])
+        slack = 8 * ROUNDED * _SUMS[0] ** self.n * patches.size + _UNIT * np.abs(patches.constants[0])
         return np.asarray(table.max(axis=tuple(range(self.n))) + patches.constants[0] + slack * _UP)
 
     # ---- the residual ---------------------------------------------------------------------------------------------
@@ -245,7 +257,7 @@ class _Solution:
 
     def _work(self) -> int:
         """Numbers that one patch takes at least."""
-        return 4 * (DEGREE + 1) ** self.n * (6 + 7 * self.n)
+        return int(4 * (DEGREE + 1) ** self.n * (6 + 7 * self.n))
 
     def _needs(self, slab: Index, places: Sequence[Index], level: int) -> Array:
         """What every patch needs as eta; 0 where v is beyond its end."""
@@ -253,6 +265,7 @@ class _Solution:
         for first in range(0, len(slab), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
             own, here = slab[rows], [place[rows] for place in places]
+            self.budget.floats(200 * len(own), 40)
             cells, which = np.unique(np.ravel_multi_index(here, shape), return_inverse=True)
             models = self._models(np.unravel_index(cells, shape), level)
             for start in range(0, len(own), _CHUNK):
@@ -280,19 +293,19 @@ class _Solution:
         """At least v_t + L v on every patch."""
         n, degree, count = self.n, _TAYLOR[self.n], len(which)
         deep = DEGREE + 1 + degree
-        monomials = sum(np.any(model.coefficients, axis=1).sum() for *_, model in models)
+        monomials = sum(int(np.any(model.coefficients, axis=1).sum()) for *_, model in models)
         self.budget.fits(8 * count * (3 * 4 * deep**n + 6 * 4 * (DEGREE + 1) ** n))
         self.budget.floats(
-            count * 4 * ((DEGREE + 1) ** n * (3 * int(monomials) + 8 * len(models) + 12) + n * deep ** (n + 1) // 2),
-            6 * int(monomials) + 20 * len(models) + 40,
+            count * 4 * ((DEGREE + 1) ** n * (3 * monomials + 8 * len(models) + 12) + n * deep ** (n + 1) // 2),
+            6 * monomials + 20 * len(models) + 40,
         )
         powers = patches.powers()
         total = np.zeros((4, *[deep] * n, count))
-        inner = (slice(None), *[slice(0, DEGREE + 1)] * n)
+        inner: tuple[slice, ...] = (slice(None), *[slice(0, DEGREE + 1)] * n)
         total[inner] = _risen(np.diff(powers, axis=0) * (3 / patches.step))
-        total[(slice(None), *[0] * n)] += patches.speeds
+        total.reshape(4, -1, count)[:, 0] += patches.speeds
         rounded, missed = 12 / patches.step * _SUMS[0] ** n, patches.off.copy()
-        sums = deep * n * 8 + 400 + int(monomials)
+        sums = deep * n * 8 + 400 + monomials
         for orders, weight, model in models:
             slope = _derivative(powers, orders)
             scale = np.full(count, weight)

@@ -1,17 +1,18 @@
 """What a certificate by the backward equation states: v, quintic splines in space, cubic in time, and v on patches.
 
-An axis has nodes z_0 < ... < z_N, five-fold at both ends; its splines have N + 5 coefficients and are C^4. At every time
-t_k the file states the coefficients U_k of v and D_k of v_t, as whole numbers times a unit. On the slab [t_k, t_{k+1}],
-of length h, v has the Bernstein coefficients in time
+An axis has nodes z_0 < ... < z_N, five-fold at both ends; its splines have N + 5 coefficients and are C^4. At every
+time t_k the file states the coefficients U_k of v and D_k of v_t, as whole numbers times a unit. On the slab
+[t_k, t_{k+1}], of length h, v has the Bernstein coefficients in time
 
     b_0 = U_k,  b_1 = U_k + h D_k / 3,  b_2 = U_{k+1} - h D_{k+1} / 3,  b_3 = U_{k+1},
 
-so that v is continuously differentiable in time at its ends too. A *patch* is a slab and one interval of every axis, cut
-into 2^level equal parts. There every b_j is taken less its corner coefficient, whole numbers that subtract exactly: what
-is rounded then is how v varies on a patch, at most ``size`` there, and not v. Blossoming leads from the coefficients to
-those of Bernstein's form by averages with weights that are computed to a relative 2^-48, so that the latter are off by at
-most ``ROUNDED`` of the size, and those of powers of xi in [-1, 1] by at most that times binomial (5, k) an axis: the
-powers' coefficients of Bernstein's polynomials have binomial (5, k) as the sum of their magnitudes.
+so that v is continuously differentiable in time at its ends too. A *patch* is a slab and one interval of every axis,
+cut into 2^level equal parts. There every b_j is taken less its corner coefficient, whole numbers that subtract exactly:
+what is rounded then is how v varies on a patch, at most ``size`` there, and not v. Blossoming leads from the
+coefficients to those of Bernstein's form by averages with weights that are computed to a relative 2^-48, so that the
+latter are off by at most ``ROUNDED`` of the size, and those of powers of xi in [-1, 1] by at most that times
+binomial (5, k) an axis: the powers' coefficients of Bernstein's polynomials have binomial (5, k) as the sum of their
+magnitudes.
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ class Splines:
         """From coefficients to Bernstein's form on each part of each cell, shape (6, 6, 2^level N): averages."""
         def make() -> Array:
             nodes, parts = self.axes[axis], 2**level
-            self.budget.fits(8 * 400 * parts * len(nodes))
+            self.budget.take(8 * 36 * parts * len(nodes))
+            self.budget.fits(8 * 200 * parts * len(nodes))
             self.budget.floats(1500 * parts * len(nodes), 2000)
             whole = _blossomed(nodes)
             found = np.stack([np.einsum("jk,kmc->jmc", _part(level, part), whole) for part in range(parts)], axis=-1)
@@ -91,11 +93,11 @@ class Splines:
         numbers = 4 * (DEGREE + 1) ** n * count
         self.budget.fits(8 * 5 * numbers)
         self.budget.floats(numbers * (6 + 7 * n), 60)
-        window: list[Array] = []
+        window: list[Index] = []
         for axis, place in enumerate(places):
             steps = np.arange(DEGREE + 1).reshape([-1 if k == axis else 1 for k in range(n)] + [1])
             window.append((place >> level) + steps)
-        early, late = (tuple([slab + k, *window]) for k in (0, 1))
+        early, late = ((slab + k, *window) for k in (0, 1))
         corner = (0,) * n
         given = [self.values[early], self.rates[early], self.rates[late], self.values[late]]
         first, start, end, last = (part[corner] for part in given)
@@ -147,7 +149,8 @@ class Patches:
         """At most v, everywhere on each patch."""
         n = len(self.half)
         least = self.local.min(axis=tuple(range(1, n + 1))) + self.constants
-        slack = ROUNDED * self.size + 2.0**-48 * (np.abs(self.constants).max(axis=0) + self.step * np.abs(self.speeds).max(axis=0))
+        moved = np.abs(self.constants).max(axis=0) + self.step * np.abs(self.speeds).max(axis=0)
+        slack = ROUNDED * self.size + 2.0**-48 * moved
         return np.asarray(least.min(axis=0) - slack * (1 + 2.0**-40))
 
     def take(self, places: Index) -> Patches:
@@ -173,7 +176,7 @@ def along(matrix: Array, table: Array, axis: int) -> Array:
     """A matrix along one axis of a contiguous array."""
     shape = table.shape
     flat = table.reshape(math.prod(shape[:axis]), shape[axis], -1)
-    return np.matmul(matrix, flat).reshape(*shape[:axis], len(matrix), *shape[axis + 1 :])
+    return np.asarray(np.matmul(matrix, flat).reshape(*shape[:axis], len(matrix), *shape[axis + 1 :]))
 
 
 def read_splines(record: Record, dimension: int, horizon: float, budget: Budget) -> Splines:

@@ -94,7 +94,7 @@ def _refuse(problem: Problem) -> None:
     if any(node.op == "input" and node.args[0] == 0 for tape in tapes for node in tape.nodes):
         raise CertificateError("no certificate of the backward equation states a model that changes with time yet.")
     if problem.initial.random or problem.ending or problem.reach is not None or problem.endless:
-        raise CertificateError("no certificate of the backward equation states random starts, targets or other ends yet.")
+        raise CertificateError("no certificate of the backward equation states random starts or targets yet.")
 
 
 def _stated(found: RoundedSide) -> dict[str, Any]:

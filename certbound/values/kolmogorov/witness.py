@@ -1,8 +1,8 @@
 """What is kept of a bound's proof: the function v of one side, and v with rounded coefficients, proved anew.
 
-Quintic B-splines add up to 1, so that v at the starts moves by at most half a unit when every coefficient is rounded to a
-multiple of it. The residual moves by |f| / h + a / h^2 times as much where a cell has the width h, and by three half units
-over the length of the slab; a rounded rate moves it by two half units of its own.
+Quintic B-splines add up to 1, so that v at the starts moves by at most half a unit when every coefficient is rounded
+to a multiple of it. The residual moves by |f| / h + a / h^2 times as much where a cell has the width h, and by three
+half units over the length of the slab; a rounded rate moves it by two half units of its own.
 """
 
 from __future__ import annotations
