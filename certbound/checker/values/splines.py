@@ -1,6 +1,6 @@
 """What a certificate by the backward equation states: v, quintic splines in space, cubic in time, and v on patches.
 
-An axis has nodes z_0 < ... < z_N, five-fold at both ends; its splines have N + 5 coefficients and are C^4. At every
+An axis has nodes z_0 < ... < z_N, six-fold at both ends; its splines have N + 5 coefficients and are C^4. At every
 time t_k the file states the coefficients U_k of v and D_k of v_t, as whole numbers times a unit. On the slab
 [t_k, t_{k+1}], of length h, v has the Bernstein coefficients in time
 
