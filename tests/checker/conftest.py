@@ -32,7 +32,7 @@ from certbound.safety.certificates import linear
 from certbound.safety.verification import verify_safety
 from certbound.values.continuous import bound_exits
 from certbound.values.continuous.line import ladder
-from certbound.values.kolmogorov import Bounds
+from certbound.values.kolmogorov import Bounds, Witness
 from certbound.values.kolmogorov.box_setting import setting_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import refined, starts_in
@@ -245,10 +245,9 @@ def backward_answer(
     side = Side(setting_of(problem), np.full(n, cell), steps, not lower)
     side.propose()
     bound = refined(side, starts_in(problem))[0]
-    assert side.witness is not None
     found = Bounds(
         lower=max(-bound, 0.0) if lower else 0.0, upper=1.0 if lower else bound, cells=(0,) * n, steps=steps, runs=1,
-        estimate=abs(bound), work=0.0, witnesses=(side.witness,),
+        estimate=abs(bound), work=0.0, witnesses=Witness.of(side),
     )  # fmt: skip
     level = np.log10(found.lower) if lower else 0.0
     answer = EngineAnswer(

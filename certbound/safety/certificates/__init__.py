@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from certbound.safety.certificates.backward import backward_proof, backward_proof_below
 from certbound.safety.certificates.barrier import barrier_proof
+from certbound.safety.certificates.carried_values import backward_proof, backward_proof_below
 from certbound.safety.certificates.constants import constants_proof
 from certbound.safety.certificates.diffusion import response_proof
 from certbound.safety.certificates.quadratic import quadratic_proof

@@ -23,7 +23,6 @@ from certbound.values.kolmogorov.face_exits import face_of, shortfall
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.solve import Discretised, discretised
 from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
-from certbound.values.kolmogorov.witness import Witness
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
@@ -137,6 +136,16 @@ def _later(given: Callable[[float], Array | float], begin: float, step: float, p
     return given(begin + part * step)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Best:
+    """The pass that proved most: at least v at the start, the bound of the side, and the coefficients then."""
+
+    value: float
+    bound: float
+    values: list[Array]
+    rates: list[Array]
+
+
 class Side:
     """One bound on one grid.
 
@@ -174,7 +183,7 @@ class Side:
         ]
         self.values: list[Array] = []
         self.rates: list[Array] = []
-        self.witness: Witness | None = None
+        self.best: Best | None = None
 
     @property
     def work(self) -> int:
@@ -201,6 +210,11 @@ class Side:
     def lacking(self) -> float:
         """The most that v lacks at the end and at faces where paths can leave."""
         return max(float(self.shortfall_at_end().max()), *(float(missing.max()) for missing in self.shortfalls()))
+
+    def remember(self, value: float, bound: float) -> None:
+        """Keep the coefficients as they are now where they prove more than before."""
+        if self.best is None or bound < self.best.bound:  # later passes replace the arrays and do not change them
+            self.best = Best(value=value, bound=bound, values=list(self.values), rates=list(self.rates))
 
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""

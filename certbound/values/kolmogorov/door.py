@@ -112,7 +112,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
             last = (1 + _LEAST) * _USUAL * side.work > budget - work
             bound, value, passes = refined(side, starts, math.inf if last or not delta else delta if above else -delta)
             work += passes * side.work
-            kept += () if side.witness is None else (side.witness,)
+            kept += Witness.of(side)
             lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
             yield Bounds(
                 lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work,
@@ -151,8 +151,8 @@ def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float
         missing = side.lacking()
         value = largest_at_start(side, starts)[1]
         bound = value + (left + missing) * (1 + 1e-9) + 1e-15
-        if bound < best:
-            best, side.witness = bound, Witness.of(side, value, bound)
+        best = min(best, bound)
+        side.remember(value, bound)
         paid, hopeless = left + missing <= _PAID * abs(value), value >= min(1.0 if side.above else 0.0, target)
         if paid or hopeless or passes == _PASSES:
             return best, value, passes

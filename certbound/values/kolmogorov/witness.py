@@ -10,15 +10,12 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.values.kolmogorov.carry import Side
 from certbound.watch import poll
-
-if TYPE_CHECKING:
-    from certbound.values.kolmogorov.carry import Side
 
 _SOLVER = ("mesh", "carrier", "maps", "carried_maps")
 _FINER = 2  # bits more, where rounded coefficients raise the bound by more than there is room for
@@ -70,13 +67,15 @@ class Witness:
     bound: float
 
     @classmethod
-    def of(cls, side: Side, value: float, bound: float) -> Witness:
-        """What is kept of a side now; later passes replace its coefficients and do not change them."""
+    def of(cls, side: Side) -> tuple[Witness, ...]:
+        """What is kept of a side: nothing where it has proved no bound."""
+        if side.best is None:
+            return ()
         kept = copy.copy(side)
-        kept.values, kept.rates = list(side.values), list(side.rates)
+        kept.values, kept.rates = side.best.values, side.best.rates
         for name in _SOLVER:
             vars(kept).pop(name, None)
-        return cls(side=kept, value=value, bound=bound)
+        return (cls(side=kept, value=side.best.value, bound=side.best.bound),)
 
     def rounded(self, room: float) -> RoundedSide:
         """v with as few digits as raise its bound by at most ``room``; proved by the engine's own inequality."""

@@ -16,14 +16,14 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.report import unlimited
 from certbound.checker.statement import read_model
-from certbound.checker.values import kolmogorov
-from certbound.checker.values.kolmogorov import _Solution
-from certbound.checker.values.splines import DEGREE, ROUNDED, Splines
+from certbound.checker.values.kolmogorov import supersolution
+from certbound.checker.values.kolmogorov.supersolution import Solution
+from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, compile_numpy
 from certbound.safety.answers import EngineAnswer, exact
 from certbound.safety.certificate import problem_data
-from certbound.safety.certificates import backward, backward_proof, backward_proof_below
+from certbound.safety.certificates import backward_proof, backward_proof_below, carried_values
 from certbound.values.kolmogorov import Bounds
 from tests.checker.conftest import (
     backward_answer,
@@ -55,7 +55,7 @@ def space() -> cb.Problem:
     return cb.Problem(system, initial=[0, 0, 0], safe=[cb.Inside(cb.Box([-1] * 3, [1] * 3))], horizon=1.0)
 
 
-def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator, size: float = 1.0) -> _Solution:
+def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator, size: float = 1.0) -> Solution:
     """A proof whose v is anything on uneven nodes."""
     n = problem.system.dimension
     axes = tuple(np.sort(np.concatenate([[-0.9, 0.9], rng.uniform(-0.9, 0.9, cells - 1)])) for _ in range(n))
@@ -65,9 +65,9 @@ def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator,
     made = Splines(axes=axes, times=times, values=rows[0], rates=rows[1], budget=unlimited())
     proof = {"engine": "backward", "axes": exact([list(a) for a in axes]), "times": exact(times),
              "units": exact([1.0, 1.0]), "values": "", "rates": "", "eta": exact([1e9] * slabs)}  # fmt: skip
-    with patch.object(kolmogorov, "read_splines", lambda *_: made):
+    with patch.object(supersolution, "read_splines", lambda *_: made):
         model = read_model(json.loads(json.dumps(problem_data(problem))), unlimited())
-        return _Solution(model, proof, unlimited(), upper=True)
+        return Solution(model, proof, unlimited(), upper=True)
 
 
 def value(splines: Splines, t: float, x: np.ndarray, orders: tuple[int, ...], rate: bool = False) -> float:
@@ -152,7 +152,7 @@ def test_on_a_small_part_of_a_cell_the_bound_is_the_residual_itself(build, cells
 
 def test_parts_of_patches_cover_them_where_the_file_states_too_little(monkeypatch: pytest.MonkeyPatch) -> None:
     solution = rough(sheared(), 3, 2, np.random.default_rng(9))
-    monkeypatch.setattr(kolmogorov, "_DEEPEST", 1)
+    monkeypatch.setattr(supersolution, "_DEEPEST", 1)
     solution.stated[:] = -1.0
     shape = (*(2 * count for count in solution.splines.cells), 2)
     *places, slab = np.unravel_index(np.arange(np.prod(shape)), shape)
@@ -290,7 +290,7 @@ def test_the_writer_says_what_no_certificate_states_yet() -> None:
 
 def test_arrays_of_more_than_the_limit_are_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, answer = backward_answer(toggle, lower=False)
-    monkeypatch.setattr(backward, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(carried_values, "_MOST_BYTES", 1000)
     assert "too much for a certificate" in refused(problem, answer)
 
 
@@ -298,7 +298,7 @@ def test_the_coarsest_grid_that_decides_is_written() -> None:
     problem, answer = backward_answer(toggle, lower=False)
     (witness,) = answer.details.witnesses
     rows = [SimpleNamespace(side=witness.side, bound=bound) for bound in (0.5, 0.25, 0.2)]
-    assert backward._coarsest(problem, rows).bound == 0.25
-    assert backward._coarsest(problem.replace(delta=0.1), rows).bound == 0.2
+    assert carried_values.coarsest(problem, rows).bound == 0.25
+    assert carried_values.coarsest(problem.replace(delta=0.1), rows).bound == 0.2
     assert isinstance(answer.details, Bounds)
     assert "claim" in json.loads(side_of(problem, {"backward": answer}, lower=False))

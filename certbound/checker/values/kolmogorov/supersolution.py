@@ -1,6 +1,6 @@
 """The proof by the backward equation (Thm K10): a function v, its error included, that the process cannot increase.
 
-The file states v in a box (`splines`). With L v = f . v_x + tr(a v_xx) / 2, a = g g^T, and ``end`` = 1 from above, 0
+The file states v in a box (`patches`). With L v = f . v_x + tr(a v_xx) / 2, a = g g^T, and ``end`` = 1 from above, 0
 from below, proved is
 
 - v_t + L v <= eta_k in slab k wherever v < end;
@@ -19,7 +19,7 @@ about the patch's middle are made; their polynomials times those of v's derivati
 every xi, which lie below the largest of their Bernstein coefficients. What the models miss is paid by the size of the
 derivatives. Where that does not show what the file states as ``eta``, the patch is cut; eta is what is found at last.
 
-Roundings. An entry of the derivative of orders alpha of b_j, by powers of xi, is off by at most `splines.ROUNDED`
+Roundings. An entry of the derivative of orders alpha of b_j, by powers of xi, is off by at most `patches.ROUNDED`
 times the size times prod_i (2 / h_i)^alpha_i binomial (5, k_i) k_i!/(k_i - alpha_i)!, whose sums over k are ``_SUMS``.
 The sum of all products, and the matrices to Bernstein's form, whose entries are at most 1, add a rounding for each
 term of a sum.
@@ -41,7 +41,7 @@ from certbound.checker.statement import Model, SafeSet, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.batches import Array, Batch, Index, Mask, above, below, bernstein, terms
-from certbound.checker.values.splines import DEGREE, ROUNDED, Patches, Splines, along, read_splines
+from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Patches, Splines, along, read_splines
 from certbound.problem.model import Tape
 
 Orders = tuple[int, ...]
@@ -64,7 +64,7 @@ _TOGETHER = 4096
 def check_backward(model: Model, value: object, budget: Budget) -> arb:
     """Upper bound of the probability that a constraint is broken."""
     with np.errstate(all="ignore"):  # what is no number is unknown
-        return _Solution(model, value, budget, upper=True).bound()
+        return Solution(model, value, budget, upper=True).bound()
 
 
 def check_backward_below(model: Model, value: object, budget: Budget) -> arb:
@@ -72,10 +72,10 @@ def check_backward_below(model: Model, value: object, budget: Budget) -> arb:
     if model.initial.around:
         raise Unproved("the initial set is stated by a box around it, of which lower bounds say nothing")
     with np.errstate(all="ignore"):
-        return _Solution(model, value, budget, upper=False).bound()
+        return Solution(model, value, budget, upper=False).bound()
 
 
-class _Solution:
+class Solution:
     """The proof's numbers, and what follows from them."""
 
     def __init__(self, model: Model, value: object, budget: Budget, *, upper: bool) -> None:

@@ -6,7 +6,7 @@ import base64
 import math
 import zlib
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,7 +25,9 @@ from certbound.safety.certificates.step_values import (
     some_starts,
     stretched,
 )
-from certbound.values.kolmogorov import Bounds, RoundedSide, Witness
+
+if TYPE_CHECKING:
+    from certbound.values.kolmogorov import RoundedSide, Witness
 
 _SHARE = 1e-3  # of a bound, by which rounding may raise it
 _OF_ROOM = 0.2  # of the distance to delta, by which it may
@@ -61,12 +63,12 @@ def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 
 def _rounded(problem: Problem, answer: EngineAnswer, attempt: int, *, above: bool) -> tuple[RoundedSide, float]:
     """The coarsest function that proves what the best one does, rounded; and the room of the claim."""
     _refuse(problem)
-    known = answer.details.witnesses if isinstance(answer.details, Bounds) else ()
+    known: tuple[Witness, ...] = getattr(answer.details, "witnesses", ())
     kept = [one for one in known if one.side.above == above]
     if not kept:
         raise CertificateError("the engine kept no function that a certificate can state.")
     effort = min(attempt, len(ROOMS) - 1)
-    chosen = _coarsest(problem, kept)
+    chosen = coarsest(problem, kept)
     sign = 1.0 if above else -1.0
     left = sign * (problem.delta - sign * chosen.bound)  # positive where the bound decides
     most = _SHARE * abs(chosen.bound)
@@ -76,7 +78,7 @@ def _rounded(problem: Problem, answer: EngineAnswer, attempt: int, *, above: boo
     return chosen.rounded(room), ROOMS[effort]
 
 
-def _coarsest(problem: Problem, kept: list[Witness]) -> Witness:
+def coarsest(problem: Problem, kept: list[Witness]) -> Witness:
     """The first of them that is about as good as the best, or that decides with some room."""
     best = min(one.bound for one in kept)
     target = problem.delta if kept[0].side.above else -problem.delta
