@@ -14,7 +14,7 @@ from tests.checker.forgeries import _BASES, Data, _scale, _sharp, forges
 
 LESS = "less than the claimed|no bound above 0"
 MORE = "more than the claimed"
-_PROOF, _SPLINES = "values/kolmogorov/supersolution.py", "values/kolmogorov/patches.py"
+_PROOF, _SPLINES = "values/kolmogorov/patch_residual.py", "values/kolmogorov/patches.py"
 
 _BASES |= {
     "solved": _sharp(lambda: conftest.backward_certificate(conftest.toggle)),

@@ -16,8 +16,8 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.report import unlimited
 from certbound.checker.statement import read_model
-from certbound.checker.values.kolmogorov import supersolution
-from certbound.checker.values.kolmogorov.supersolution import Solution
+from certbound.checker.values.kolmogorov import patch_residual
+from certbound.checker.values.kolmogorov.patch_residual import Solution
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, compile_numpy
@@ -65,7 +65,7 @@ def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator,
     made = Splines(axes=axes, times=times, values=rows[0], rates=rows[1], budget=unlimited())
     proof = {"engine": "backward", "axes": exact([list(a) for a in axes]), "times": exact(times),
              "units": exact([1.0, 1.0]), "values": "", "rates": "", "eta": exact([1e9] * slabs)}  # fmt: skip
-    with patch.object(supersolution, "read_splines", lambda *_: made):
+    with patch.object(patch_residual, "read_splines", lambda *_: made):
         model = read_model(json.loads(json.dumps(problem_data(problem))), unlimited())
         return Solution(model, proof, unlimited(), upper=True)
 
@@ -152,7 +152,7 @@ def test_on_a_small_part_of_a_cell_the_bound_is_the_residual_itself(build, cells
 
 def test_parts_of_patches_cover_them_where_the_file_states_too_little(monkeypatch: pytest.MonkeyPatch) -> None:
     solution = rough(sheared(), 3, 2, np.random.default_rng(9))
-    monkeypatch.setattr(supersolution, "_DEEPEST", 1)
+    monkeypatch.setattr(patch_residual, "_DEEPEST", 1)
     solution.stated[:] = -1.0
     shape = (*(2 * count for count in solution.splines.cells), 2)
     *places, slab = np.unravel_index(np.arange(np.prod(shape)), shape)

@@ -1,5 +1,5 @@
-"""A solution of the backward equation with its error: ``patches`` (what a file states), ``supersolution`` (Thm K10)."""
+"""A solution of the backward equation with its error: ``patches`` (what a file states), ``patch_residual`` (Thm K10)."""
 
-from certbound.checker.values.kolmogorov.supersolution import check_backward, check_backward_below
+from certbound.checker.values.kolmogorov.patch_residual import check_backward, check_backward_below
 
 __all__ = ["check_backward", "check_backward_below"]
