@@ -587,12 +587,12 @@ def _() -> Data:
     return file(problem(2), solution([8, 8], 4, values=wholes(30_000_000)))
 
 
-@bomb("a long tape on every part of a cell", WORK)
+@bomb("a long tape on two million cells of a solution", WORK)
 def _() -> Data:
     dynamics = tape(2, ["input", 1], *[["add", k, 0] for k in range(16_000)])
     dynamics["nodes"].append(["add", 16_000, dynamics["outputs"][0]])
     dynamics["outputs"][0] = len(dynamics["nodes"]) - 1
-    return file(problem(2, dynamics=dynamics), solution([150, 150], 40))
+    return file(problem(2, dynamics=dynamics), solution([1400, 1400], 1))
 
 
 @bomb("values of all operations on cells of a solution", MEMORY)
@@ -604,10 +604,10 @@ def _() -> Data:
     return file(problem(2, dynamics=dynamics), solution([64, 64], 1))
 
 
-@bomb("columns of noise on cells of a solution", MORE)
+@bomb("columns of noise on cells of a solution", WORK)
 def _() -> Data:
     noise = {"law": "wiener", "diffusion": [[ONE] * 400] * 3}
-    return file(problem(3, noise=noise), solution([60, 60, 60], 6))
+    return file(problem(3, noise=noise), solution([120, 120, 120], 1))
 
 
 @bomb("lists in the axes of a solution", "must be a number")

@@ -1,4 +1,4 @@
-"""A solution of the backward equation with its error: ``patches`` (what a file states), ``patch_residual`` (Thm K10)."""
+"""A solution of the backward equation with its error: ``patches`` (v of a file), ``patch_residual`` (Thm K10)."""
 
 from certbound.checker.values.kolmogorov.patch_residual import check_backward, check_backward_below
 

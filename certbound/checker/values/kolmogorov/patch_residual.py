@@ -104,6 +104,8 @@ class Solution:
 
     def bound(self) -> arb:
         """At least the probability of failing from any start, or (lower) at most that from one of the stated ones."""
+        patches = self.splines.slabs * math.prod(self.splines.cells)
+        self.budget.expect(patches * self._work() + self._work_of_models())
         limits = self._limits()
         start = self._at_starts()
         gamma = max([0.0, -self._at_end(), *(self._lacking(limits, *face) for face in self._faces())])
@@ -235,7 +237,6 @@ class Solution:
         """eta of every slab: what its patches need, which the file says about."""
         splines, n = self.splines, self.n
         eta, count = np.zeros(splines.slabs), splines.slabs * math.prod(splines.cells)
-        self.budget.expect(count * self._work())
         self.budget.fits(8 * 4 * (n + 2) * count)
         *places, slab = np.unravel_index(np.arange(count), (*splines.cells, splines.slabs))
         for level in range(_DEEPEST + 1):
@@ -258,6 +259,14 @@ class Solution:
     def _work(self) -> int:
         """Numbers that one patch takes at least."""
         return int(4 * (DEGREE + 1) ** self.n * (6 + 7 * self.n))
+
+    def _work_of_models(self) -> int:
+        """Numbers that the model takes on every cell at least, an array for each operation and three for a product."""
+        given, cells = self.model.noise.diffusion, math.prod(self.splines.cells)
+        columns = given.shape[1] if isinstance(given, Tape) else given.ncols()
+        nodes = [*self.model.dynamics.nodes, *(given.nodes if isinstance(given, Tape) else ())]
+        operations = sum(node.op != "input" for node in nodes) + 3 * self.n * self.n * columns
+        return terms(self.n, _TAYLOR[self.n], self.budget).numbers(cells) * operations
 
     def _needs(self, slab: Index, places: Sequence[Index], level: int) -> Array:
         """What every patch needs as eta; 0 where v is beyond its end."""
