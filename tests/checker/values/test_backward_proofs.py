@@ -25,6 +25,7 @@ from certbound.safety.answers import EngineAnswer, exact
 from certbound.safety.certificate import problem_data
 from certbound.safety.certificates import backward_proof, backward_proof_below, carried_values
 from certbound.values.kolmogorov import Bounds
+from tests.checker.backward_forgeries import changed
 from tests.checker.conftest import (
     backward_answer,
     backward_certificate,
@@ -302,3 +303,31 @@ def test_the_coarsest_grid_that_decides_is_written() -> None:
     assert carried_values.coarsest(problem.replace(delta=0.1), rows).bound == 0.2
     assert isinstance(answer.details, Bounds)
     assert "claim" in json.loads(side_of(problem, {"backward": answer}, lower=False))
+
+
+WRONG = {
+    "noise": lambda found, rng: found + np.rint(rng.normal(size=found.shape) * 0.02 * np.abs(found).max()).astype(int),
+    "half": lambda found, rng: found // 2,
+    "nothing": lambda found, rng: 0 * found,
+    "mirrored": lambda found, rng: found[:, ::-1],
+    "another time": lambda found, rng: np.concatenate([found[3:], found[-1:], found[-1:], found[-1:]]),
+    "negative": lambda found, rng: -found,
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("lower", [False, True])
+def test_a_wrong_function_costs_width_and_never_truth(name: str, lower: bool) -> None:
+    """2e4 simulated paths put the probability into [.650, .684] with confidence 1 - 1e-6."""
+    rng = np.random.default_rng(2)
+    data = parse(backward_certificate(loud_toggle, lower=lower, steps=16))
+    for array in ("values", "rates"):
+        changed(data, array, lambda found: found.__setitem__(slice(None), WRONG[name](found.copy(), rng)))
+    data["proof"]["eta"] = exact([1e9] * len(data["proof"]["eta"]))  # no patch is cut
+    data["claim"] |= {"log10_lower": exact(-0.01)} if lower else {"log10_delta": exact(-9.0)}
+    report = check_data(data)
+    assert not report.valid
+    if lower:
+        assert report.log10_lower_proved is None or report.log10_lower_proved <= np.log10(0.684)
+    else:
+        assert report.log10_proved is None or report.log10_proved >= np.log10(0.650)
