@@ -17,7 +17,7 @@ from certbound.arrays import Array
 from certbound.values.kolmogorov.carry import Side
 from certbound.watch import poll
 
-_SOLVER = ("mesh", "carrier", "maps", "carried_maps")
+_SOLVER = ("setting", "mesh", "carrier", "maps", "carried_maps")
 _FINER = 2  # bits more, where rounded coefficients raise the bound by more than there is room for
 _MOST_BITS = 50
 
@@ -60,11 +60,13 @@ class Witness:
         At least v at the start that counts.
     bound : float
         P <= bound from above, P >= -bound from below.
+    horizon : float
     """
 
     side: Side
     value: float
     bound: float
+    horizon: float
 
     @classmethod
     def of(cls, side: Side) -> tuple[Witness, ...]:
@@ -75,11 +77,11 @@ class Witness:
         kept.values, kept.rates = side.best.values, side.best.rates
         for name in _SOLVER:
             vars(kept).pop(name, None)
-        return (cls(side=kept, value=side.best.value, bound=side.best.bound),)
+        return (cls(side=kept, value=side.best.value, bound=side.best.bound, horizon=float(side.setting.horizon)),)
 
     def rounded(self, room: float) -> RoundedSide:
         """v with as few digits as raise its bound by at most ``room``; proved by the engine's own inequality."""
-        side, span = self.side, float(self.side.setting.horizon)
+        side, span = self.side, self.horizon
         slope = self._slope()
         exponents = [math.floor(math.log2(room / (2 * (span * slope + 3 * len(side.steps))))),
                      math.floor(math.log2(room / (4 * span)))]  # fmt: skip
@@ -107,8 +109,8 @@ class Witness:
         side.values, side.rates = (list(rows * unit) for rows, unit in zip(whole, units))
         eta = np.array([float(rows.max()) for rows in side.residuals()])
         left = float(np.dot(side.steps, eta)) + side.lacking()
-        times = float(side.setting.horizon) - np.concatenate([[0.0], np.cumsum(side.steps)])[::-1]
-        times[0], times[-1] = 0.0, float(side.setting.horizon)
+        times = self.horizon - np.concatenate([[0.0], np.cumsum(side.steps)])[::-1]
+        times[0], times[-1] = 0.0, self.horizon
         return RoundedSide(
             axes=tuple(axis.nodes for axis in side.axes), times=times, units=units, values=whole[0][::-1],
             rates=whole[1][::-1], eta=np.maximum(eta[::-1], least),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from fractions import Fraction
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -264,6 +265,7 @@ def test_what_is_kept_does_not_change_with_later_passes() -> None:
     _, answer = backward_answer(toggle, lower=False)
     (witness,) = answer.details.witnesses
     assert not hasattr(witness.side, "carrier")
+    assert pickle.loads(pickle.dumps(witness)).bound == witness.bound
     assert witness.bound == answer.details.upper
 
 
