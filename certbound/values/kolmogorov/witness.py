@@ -19,7 +19,7 @@ from certbound.watch import poll
 
 _SOLVER = ("setting", "mesh", "carrier", "maps", "carried_maps")
 _FINER = 2  # bits more, where rounded coefficients raise the bound by more than there is room for
-_MOST_BITS = 50
+_MOST_BITS = 42  # of a whole number: five differences of such have 15 digits at most
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
