@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 from fractions import Fraction
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from certbound.checker.report import unlimited
 from certbound.checker.statement import read_model
 from certbound.checker.values.kolmogorov import patch_residual
 from certbound.checker.values.kolmogorov.patch_residual import Solution
-from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines
+from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines, to_powers
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, compile_numpy
 from certbound.safety.answers import EngineAnswer, exact
@@ -182,6 +183,7 @@ def test_coefficients_on_patches_are_off_by_less_than_is_said(level: int) -> Non
     place = np.arange(7 * 2**level)
     patches = splines.patches(0 * place, [place], level)
     knots = [Fraction(x) for x in [axis[0]] * 5 + axis.tolist() + [axis[-1]] * 5]
+    powers, change = patches.powers(), [[Fraction(x) for x in row] for row in to_powers().tolist()]
     step, off = Fraction(0.3), 0.0
     for p in place.tolist():
         c, part = divmod(p, 2**level)
@@ -192,10 +194,29 @@ def test_coefficients_on_patches_are_off_by_less_than_is_said(level: int) -> Non
         rows = [u, [a + b for a, b in zip(u, d)], [a - b for a, b in zip(w, e)], w]
         for j, row in enumerate(rows):
             less = [x - row[0] for x in row]
-            for k in range(6):
-                exact_ = blossom(knots[c : c + 12], less, [ends[0]] * (5 - k) + [ends[1]] * k)
-                off = max(off, abs(float(Fraction(patches.local[j, k, p]) - exact_)) / patches.size[p])
+            true = [blossom(knots[c : c + 12], less, [ends[0]] * (5 - k) + [ends[1]] * k) for k in range(6)]
+            for k, factors in enumerate(change):
+                off = max(off, abs(float(Fraction(patches.local[j, k, p]) - true[k])) / patches.size[p])
+                power = abs(float(Fraction(powers[j, k, p]) - sum(a * b for a, b in zip(factors, true))))
+                assert power <= ROUNDED * math.comb(5, k) * patches.size[p]
     assert 0 < off <= ROUNDED
+
+
+def test_v_on_a_face_is_that_of_its_outermost_coefficients() -> None:
+    rng = np.random.default_rng(11)
+    splines = rough(space(), 2, 2, rng).splines
+    for axis in range(3):
+        for side in (0, 1):
+            face = splines.face(axis, side)
+            *places, slab = np.unravel_index(np.arange(np.prod((*face.cells, 2))), (*face.cells, 2))
+            least = face.patches(slab, places, 0).lowest().min()
+            seen = []
+            for share in rng.random((30, 4)):
+                x = np.array([row[0] + s * (row[-1] - row[0]) for row, s in zip(splines.axes, share[1:])])
+                x[axis] = splines.axes[axis][-side]
+                seen.append(value(splines, share[0], x, (0, 0, 0)))
+            assert least <= min(seen)
+            assert least >= min(seen) - 4
 
 
 @pytest.mark.parametrize("level", [0, 2])
