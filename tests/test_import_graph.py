@@ -144,7 +144,7 @@ MANY_DOORS = {
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (9, "to and from each library"),
-    "safety.certificates": (7, "a writer an engine, one for each side where it has two, and one of other coordinates"),
+    "safety.certificates": (9, "a writer an engine, one for each side where it has two, and one of other coordinates"),
     "safety.engines": (20, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),

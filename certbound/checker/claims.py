@@ -379,11 +379,27 @@ def _values_below(model: Model, proof: object, budget: Budget) -> arb:
     return check_values_below(model, proof, budget)
 
 
+def _backward(model: Model, proof: object, budget: Budget) -> arb:
+    from certbound.checker.values import check_backward
+
+    return check_backward(model, proof, budget)
+
+
+def _backward_below(model: Model, proof: object, budget: Budget) -> arb:
+    from certbound.checker.values import check_backward_below
+
+    return check_backward_below(model, proof, budget)
+
+
 ENGINES = {
     "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive, holds=True),
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),
+    "backward": Engine(
+        words="a solution of the backward equation, its error included (Thm K10)", prove=_backward,
+        below=_backward_below,
+    ),
     "lasting": Engine(words="a function of the state alone", prove=check_lasting, below=check_lasting_below),
     "rate": Engine(words="how fast paths leave", prove=check_leaving, below=check_leaving_below),
     "surely": Engine(words="noise that leads every path out", prove=check_surely, below=check_surely_below),

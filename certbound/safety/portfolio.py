@@ -18,6 +18,8 @@ from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
 from certbound.safety.answers import EngineAnswer, Proof, Request
 from certbound.safety.certificates import (
+    backward_proof,
+    backward_proof_below,
     barrier_proof,
     constants_proof,
     of_coordinates,
@@ -163,6 +165,8 @@ ENGINES: dict[str, Engine] = {
             when="while nothing else has proved SAFE; limits along the coordinates, noise along some states or all; "
             "bounds from both sides",
             prove=in_coordinates(backward_engine),
+            write=of_coordinates(backward_proof),
+            write_below=of_coordinates(backward_proof_below, below=True),
             reserve=True,
             refines=True,
             dear=True,

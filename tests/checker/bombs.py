@@ -30,7 +30,7 @@ ZERO, ONE, HALF = "0x0.0p+0", "0x1.0p+0", "0x1.0p-1"
 BOMBS: dict[str, tuple[Callable[[], Data | str], str]] = {}
 """Name to what makes the file, and what the checker says of it."""
 
-WORK, MEMORY = "more work than its limit", "more memory than its limit"
+WORK, MEMORY, MORE = "more work than its limit", "more memory than its limit", "the check needs more"
 
 
 def bomb(name: str, says: str) -> Callable[[Callable[[], Data | str]], Callable[[], Data | str]]:
@@ -549,6 +549,70 @@ def _() -> Data:
     }})  # fmt: skip
     return file(about, barrier(n, exponents=powers, coefficients=["0x1.0p-99"] * len(powers),
                               boundary="-0x1.0p+0"))
+
+
+# ---- solutions of the backward equation ----------------------------------------------------------------------
+
+
+def wholes(count: int, word: str = "0") -> str:
+    """The same whole number again and again, compressed."""
+    return packed(count, word)
+
+
+def solution(cells: list[int], slabs: int, *, lower: bool = False, **parts: Any) -> Data:
+    """A solution that is 0 everywhere, which is more than its ``eta`` allows."""
+    count = slabs + 1
+    for number in cells:
+        count *= number + 5
+    return {
+        "engine": "backward", "axes": [hexed([-0.5 + k / number for k in range(number + 1)]) for number in cells],
+        "times": hexed([k / slabs for k in range(slabs + 1)]), "units": [ONE, ONE], "values": wholes(count),
+        "rates": wholes(count), "eta": ["-0x1.0p+0"] * slabs,
+        **({"side": "lower", "starts": [[ZERO] * len(cells)]} if lower else {}), **parts,
+    }  # fmt: skip
+
+
+@bomb("patches that are cut again and again", MORE)
+def _() -> Data:
+    return file(problem(2), solution([300, 300], 30))
+
+
+@bomb("more coefficients of a solution than are read", "at most 4000000 coefficients")
+def _() -> Data:
+    return file(problem(3), solution([250, 250, 250], 1, values="", rates=""))
+
+
+@bomb("whole numbers that unpack to sixty megabytes", "and nothing else")
+def _() -> Data:
+    return file(problem(2), solution([8, 8], 4, values=wholes(30_000_000)))
+
+
+@bomb("a long tape on two million cells of a solution", WORK)
+def _() -> Data:
+    dynamics = tape(2, ["input", 1], *[["add", k, 0] for k in range(16_000)])
+    dynamics["nodes"].append(["add", 16_000, dynamics["outputs"][0]])
+    dynamics["outputs"][0] = len(dynamics["nodes"]) - 1
+    return file(problem(2, dynamics=dynamics), solution([1400, 1400], 1))
+
+
+@bomb("values of all operations on cells of a solution", MEMORY)
+def _() -> Data:
+    nodes = [["input", 1], *[["sin", 0]] * 20_000]
+    nodes += [["add", 1, 2], *[["add", 20_000 + k, k + 2] for k in range(1, 19_999)]]
+    nodes.append(["input", 2])
+    dynamics = {"nodes": nodes, "outputs": [len(nodes) - 2, len(nodes) - 1]}
+    return file(problem(2, dynamics=dynamics), solution([64, 64], 1))
+
+
+@bomb("columns of noise on cells of a solution", WORK)
+def _() -> Data:
+    noise = {"law": "wiener", "diffusion": [[ONE] * 400] * 3}
+    return file(problem(3, noise=noise), solution([120, 120, 120], 1))
+
+
+@bomb("lists in the axes of a solution", "must be a number")
+def _() -> Data:
+    return file(problem(2), solution([8, 8], 4, axes=[[[[ZERO]]] * 30_000] * 2))
 
 
 # ---- contraction constants -----------------------------------------------------------------------------------

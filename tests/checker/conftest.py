@@ -32,6 +32,10 @@ from certbound.safety.certificates import linear
 from certbound.safety.verification import verify_safety
 from certbound.values.continuous import bound_exits
 from certbound.values.continuous.line import ladder
+from certbound.values.kolmogorov import Bounds, Witness
+from certbound.values.kolmogorov.box_setting import setting_of
+from certbound.values.kolmogorov.carry import Side
+from certbound.values.kolmogorov.door import refined, starts_in
 
 
 @contextmanager
@@ -191,6 +195,72 @@ def side_of(problem: cb.Problem, answers: dict[str, EngineAnswer], *, lower: boo
     """The certificate of one of the two bounds, whatever the verdict is."""
     status = "UNSAFE" if lower else "UNKNOWN"
     return certificate_text(problem, SimpleNamespace(status=status, reason="", answers=answers))
+
+
+def toggle(noise: float = 0.3, horizon: float = 1.0) -> cb.Problem:
+    """Continuous time, for the backward equation: two genes that repress each other, noise along both states."""
+    system = cb.ContinuousSystem(
+        lambda u, v: [2 / (1 + v**2) - u, 2 / (1 + u**2) - v], states=["u", "v"], diffusion=noise * np.eye(2)
+    )
+    safe = [cb.Inside(cb.Box([0.5, 0.05], [2.6, 1.6]))]
+    return cb.Problem(system, initial=[1.5, 0.6], safe=safe, horizon=horizon, delta=0.3, name="toggle")
+
+
+def loud_toggle() -> cb.Problem:
+    """The same with so much noise that it often fails."""
+    return toggle(0.6, 2.0)
+
+
+def pendulum(noise: float = 0.5) -> cb.Problem:
+    """A pendulum with noise in the velocity alone, which nothing bounds."""
+    system = cb.ContinuousSystem(
+        lambda x, v: [v, -np.sin(x) - 0.5 * v], states=["x", "v"], diffusion=[[0.0], [noise]]
+    )
+    safe = [cb.Inside(cb.Box([-1, -np.inf], [1, np.inf]))]
+    return cb.Problem(system, initial=[0, 0], safe=safe, horizon=2.0, delta=0.6, name="pendulum")
+
+
+def loud_pendulum() -> cb.Problem:
+    """The same with so much noise that it often fails."""
+    return pendulum(0.9)
+
+
+def predator() -> cb.Problem:
+    """Holling's predator and its prey, with noise that both multiply."""
+    system = cb.ContinuousSystem(
+        lambda x, y: [x * (1 - x / 3) - x * y / (1 + x), y * (x / (1 + x) - 0.4)], states=["x", "y"],
+        diffusion=lambda x: [[0.3 * x[0], 0], [0, 0.3 * x[1]]],
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([0.3, 0.3], [3.0, 3.0]))]
+    return cb.Problem(system, initial=[1.0, 1.0], safe=safe, horizon=1.0, delta=0.3, name="predator")
+
+
+@cache
+def backward_answer(
+    build: Callable[[], cb.Problem], *, lower: bool, cell: float = 0.15, steps: int = 12
+) -> tuple[cb.Problem, EngineAnswer]:
+    """What the backward equation bounds on one coarse grid, for short checks."""
+    problem = build()
+    n = problem.system.dimension
+    side = Side(setting_of(problem), np.full(n, cell), steps, not lower)
+    side.propose()
+    bound = refined(side, starts_in(problem))[0]
+    found = Bounds(
+        lower=max(-bound, 0.0) if lower else 0.0, upper=1.0 if lower else bound, cells=(0,) * n, steps=steps, runs=1,
+        estimate=abs(bound), work=0.0, witnesses=Witness.of(side),
+    )  # fmt: skip
+    level = np.log10(found.lower) if lower else 0.0
+    answer = EngineAnswer(
+        log10_delta=0.0 if lower else np.log10(found.upper), log10_lower=level if lower else None, method="backward",
+        details=found,
+    )  # fmt: skip
+    return problem, answer
+
+
+def backward_certificate(build: Callable[[], cb.Problem], *, lower: bool = False, **grid: Any) -> str:
+    """The certificate of one side by the backward equation."""
+    problem, answer = backward_answer(build, lower=lower, **grid)
+    return side_of(problem, {"backward": answer}, lower=lower)
 
 
 def squared() -> cb.Problem:

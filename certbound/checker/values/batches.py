@@ -195,7 +195,7 @@ class Batch:
         table = np.zeros((count,) * which.variables + self.error.shape)
         for exponents, row in zip(which.exponents, self.coefficients):
             table[exponents] = row
-        matrix = _to_bernstein(count - 1)
+        matrix = bernstein(count - 1)
         for axis in range(which.variables):
             table = np.moveaxis(np.tensordot(matrix, table, axes=([1], [axis])), 0, axis)
         rows = table.reshape(-1, len(self.error))
@@ -212,7 +212,7 @@ class Batch:
 
 
 @lru_cache(maxsize=32)
-def _to_bernstein(degree: int) -> Array:
+def bernstein(degree: int) -> Array:
     """From powers of xi = 2 s - 1 in [-1, 1] to Bernstein coefficients, entries rounded once."""
     rows = []
     for j in range(degree + 1):

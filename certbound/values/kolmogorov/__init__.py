@@ -6,6 +6,7 @@ cells), ``slab_residual`` (the only trusted inequality), ``face_exits`` (what is
 ``door``.
 """
 
-from certbound.values.kolmogorov.door import bound_failing
+from certbound.values.kolmogorov.door import Bounds, bound_failing
+from certbound.values.kolmogorov.witness import RoundedSide, Witness
 
-__all__ = ["bound_failing"]
+__all__ = ["bound_failing", "Bounds", "RoundedSide", "Witness"]

@@ -34,6 +34,7 @@ _KILL = 10.0
 _REACHED = 1.5
 _ON_FACE = 0.3  # of the source that would raise e to what v lacks while a path crosses one cell
 _BATCH = 300_000  # lattice points of the slabs that are looked at together
+_RESOLVED = 3.0  # of the flow against paths times the width of a cell to squared noise
 _SKETCH = 2  # points along each axis of a cell, where nothing is proved of its residual
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
@@ -60,14 +61,16 @@ def time_steps(horizon: float, count: int, layer: float) -> Array:
 class Mesh:
     """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis).
 
-    ``leaving`` is the rate at which paths leave the cells about a node.
+    ``at_limit`` is 1 at limits that paths may leave through, less where the flow is so strong against them that the
+    grid does not resolve the layer: no exits need be counted there. ``leaving`` is the rate at which paths leave the
+    cells about a node.
     """
 
     nodes: tuple[Array, ...]
     pad: tuple[tuple[int, int], ...]
     equation: Discretised
     layer: Array
-    at_limit: Mask
+    at_limit: Array
     rate: Array
     leaving: Array
 
@@ -98,14 +101,16 @@ def mesh_of(
     shape = points.shape[1:]
     inside = np.clip(points, low.reshape(-1, *[1] * n), high.reshape(-1, *[1] * n))
     flow, spread = setting.flow(inside), setting.spread(inside).reshape(n, n, *shape)
-    dead, at_limit, layer, rate = np.zeros(shape, bool), np.zeros(shape, bool), np.ones(shape), np.zeros(shape)
+    dead, at_limit, layer, rate = np.zeros(shape, bool), np.zeros(shape), np.ones(shape), np.zeros(shape)
     for i in range(n):
         for side, place in ((0, 0), (1, shape[i] - 1)):
             face = tuple(place if k == i else slice(None) for k in range(n))
             out = (2 * side - 1) * flow[i][face]
             leaves = (spread[i, i][face] > 0) | (out >= 0)
             dead[face] |= leaves
-            at_limit[face] |= leaves & bool(setting.limited[side, i])
+            against = -out * abs(lines[i][place] - lines[i][1 if side == 0 else -2])
+            resolved = ramp(2 - against / (_RESOLVED * spread[i, i][face] + 1e-300)) if setting.noisy[i] else 1.0
+            at_limit[face] = np.maximum(at_limit[face], leaves * float(setting.limited[side, i]) * resolved)
             width = np.sqrt(spread[i, i][face].max() * span) or np.maximum(out, 0).mean() * span
             third = abs(lines[i][place] - lines[i][3 if side == 0 else -4])
             layer = layer * ramp(np.abs(points[i] - lines[i][place]) / max(width, third))
@@ -161,6 +166,16 @@ def _generator(setting: Setting, axes: tuple[Axis, ...]) -> Generator:
     return Generator.of(axes, setting.drift.on(axes, always), setting.square.on(axes, always))
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Best:
+    """The pass that proved most: at least v at the start, the bound of the side, and the coefficients then."""
+
+    value: float
+    bound: float
+    values: list[Array]
+    rates: list[Array]
+
+
 class Side:
     """One bound on one grid.
 
@@ -204,6 +219,7 @@ class Side:
         self.passes = 0
         self.values: list[Array] = []
         self.rates: list[Array] = []
+        self.best: Best | None = None
 
     def on(self, shapes: Sequence[Size]) -> Side:
         """The same side on axes of other shapes."""
@@ -235,6 +251,15 @@ class Side:
     def shortfall_at_end(self) -> Array:
         """What v(T) lacks of 0 on every cell."""
         return np.asarray(np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0))
+
+    def lacking(self) -> float:
+        """The most that v lacks at the end and at faces where paths can leave."""
+        return max(float(self.shortfall_at_end().max()), *(float(missing.max()) for missing in self.shortfalls()))
+
+    def remember(self, value: float, bound: float) -> None:
+        """Keep the coefficients as they are now where they prove more than before."""
+        if self.best is None or bound < self.best.bound:  # later passes replace the arrays and do not change them
+            self.best = Best(value=value, bound=bound, values=list(self.values), rates=list(self.rates))
 
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""

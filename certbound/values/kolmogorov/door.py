@@ -17,6 +17,7 @@ from certbound.values.kolmogorov.box_setting import Setting, setting_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.shares import Shape, better_shapes
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
+from certbound.values.kolmogorov.witness import Witness
 from certbound.watch import poll
 
 _COARSEST = {2: 0.06, 3: 0.1}  # cell of the first grid, as a share of the range
@@ -51,6 +52,8 @@ class Bounds:
         The probability by the numerical solution; nothing is proved of it.
     work : float
         Cells of space and time that passes went over.
+    witnesses : tuple of Witness
+        What proves the bounds, from coarse to fine: for certificates.
     """
 
     lower: float
@@ -60,6 +63,7 @@ class Bounds:
     runs: int
     estimate: float
     work: float
+    witnesses: tuple[Witness, ...] = ()
 
 
 def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0) -> Iterator[Bounds]:
@@ -96,6 +100,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
     sides: tuple[bool, ...] = (True, False)
     shapes: dict[bool, Shapes] = {}
+    kept: tuple[Witness, ...] = ()
     while True:
         before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
@@ -117,8 +122,12 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
                 shapes[above] = (cell, better_shapes(side, residuals, starts.points))
             bound, value, passes = refined(side, starts, target, residuals)
             work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
+            kept += Witness.of(side)
             lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
-            yield Bounds(lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work)
+            yield Bounds(
+                lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work,
+                witnesses=kept,
+            )  # fmt: skip
             if upper <= max(_CLOSE * lower, delta) or lower > delta > 0:
                 return
             if above and _FAR * estimate < delta:
@@ -176,8 +185,10 @@ def refined(
             passes += _ROUGH if rough else 1.0
         if not rough:
             left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
-            missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
-            best = min(best, value + (left + missing) * (1 + 1e-9) + 1e-15)
+            missing = side.lacking()
+            bound = value + (left + missing) * (1 + 1e-9) + 1e-15
+            best = min(best, bound)
+            side.remember(value, bound)
             paid = left + missing <= _PAID * abs(value)
         if paid or hopeless or side.passes == _PASSES:
             return best, value, passes

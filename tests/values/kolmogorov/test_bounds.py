@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -94,8 +96,13 @@ def test_the_engine_answers_in_a_verdict_and_says_how() -> None:
     verdict = cb.verify_safety(problem.replace(delta=min(3 * truth, 0.9)), method="backward")
     assert verdict.status == "SAFE"
     assert "whose error is carried" in verdict.reason
+    claim = json.loads(verdict.certificate_text(problem))["claim"]
+    assert claim["method"] == "backward"
+    assert float.fromhex(claim["log10_delta"]) >= verdict.log10_delta
     verdict = cb.verify_safety(problem.replace(delta=truth / 3), method="backward")
     assert verdict.status == "UNSAFE"
+    claim = json.loads(verdict.certificate_text(problem))["claim"]
+    assert float.fromhex(claim["log10_lower"]) <= verdict.log10_lower
 
 
 def test_three_states_are_bounded_from_above() -> None:
