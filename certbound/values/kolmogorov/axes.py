@@ -52,11 +52,12 @@ def plan_axes(setting: Setting, cell: Array, row: int) -> tuple[list[Array], lis
             if not setting.limited[side, i]:
                 continue
             points = _face(setting, low, high, i, place)
-            f, a = setting.flow(points)[i], setting.spread(points).reshape(n, n, *points.shape[1:])
-            if setting.noisy[i]:
-                sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
-            else:
-                grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place)
+            for time in setting.moments(i):
+                f, a = setting.flow(points, time)[i], setting.spread(points, time).reshape(n, n, *points.shape[1:])
+                if setting.noisy[i]:
+                    sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
+                else:
+                    grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place, time)
     return [_nodes(low[i], high[i], sizes[i]) for i in range(n)], grazing
 
 
@@ -84,7 +85,7 @@ def _layer(setting: Setting, points: Array, f: Array, a: Array, axis: int, side:
 
 def _graze(
     setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cells: Array, sizes: list[list[Size]],
-    place: float,
+    place: float, time: float,
 ) -> list[Grazing]:  # fmt: skip
     """Refine toward a noise-free limit and about the surface on it where the flow turns."""
     if not f.min() < 0 < f.max():
@@ -97,7 +98,7 @@ def _graze(
         if k != axis:
             moved = chosen.copy()
             moved[k] += 1e-5 * cells[k]
-            slopes[k] = (setting.flow(moved)[axis] - setting.flow(chosen)[axis]) / (1e-5 * cells[k])
+            slopes[k] = (setting.flow(moved, time)[axis] - setting.flow(chosen, time)[axis]) / (1e-5 * cells[k])
     mean = np.abs(slopes).mean(axis=1)
     noise = float(np.mean(np.einsum("ip,ijp,jp->p", slopes, a[:, :, near], slopes)))
     speed = 0.5 * float(np.max(mean * cells))

@@ -4,33 +4,63 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Tape, compile_numpy
+from certbound.problem.model import Graph, Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
 from certbound.problem.systems import ContinuousSystem
 from certbound.values.enclosing import squared_diffusion
 from certbound.values.kolmogorov.cell_fields import Fields
+from certbound.values.kolmogorov.factors import clock_breaks, disturbance_nodes, pace_of
+from certbound.values.kolmogorov.separation import Product, separated
 from certbound.values.room import limits_of
 
 _PATHS, _STEPS, _EVERY = 2000, 400, 10
 _RARE = 2e-4  # share of the visits that lies beyond the range on either side
 _MARGIN = 0.4  # of the range, beyond it, where no limit stands
+_MOMENTS = 7  # times at which an axis looks at a model that changes
+_USUAL_STEPS = 40.0  # over the horizon where nothing changes with time, on the coarsest grid
+
+Flow = Callable[..., Array]
+"""Of points, shape (n, ...), a time, and disturbances, shape (m, ...) or (m,), to outputs, shape (outputs, ...)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Operator:
+    """One product of the generator: the factor c(t, d), None for 1, and the drift and squared noise that it has."""
+
+    factor: Tape | None
+    drift: Fields
+    square: Fields
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Setting:
-    """A problem in a box: dX = f(t, X) dt + g(t, X) dW, limits along the coordinates, one start set.
+    """A problem in a box: dX = f(t, X, d) dt + g(t, X) dW, limits along the coordinates, one start set.
 
     Attributes
     ----------
     drift, square : Fields
         Of f and of a = g g'.
+    operators : tuple of Operator
+        The same as a sum of products of functions of (t, d) and of x.
+    disturbance : ndarray, shape (2, m)
+        Ends of the box of d.
+    nodes, gaps : ndarray, shapes (V, m) and (m,)
+        Those d that stand for all, and what lies between them (`disturbance_nodes`).
+    breaks : ndarray
+        Times at which the clock makes the model jump or bend, about.
+    timed : bool
+        Whether the model changes with time.
+    pace : float
+        How many times more steps the model's changes in time ask for than a model that does not change.
+    varies : tuple of bool
+        Whether f_i or a_ii changes with time.
     low, high : ndarray, shape (2, n)
         Ends of the box: of the safe set rounded inward (row 0) and outward (row 1); where no limit stands, ends that
         paths hardly reach.
@@ -47,6 +77,14 @@ class Setting:
 
     drift: Fields
     square: Fields
+    operators: tuple[Operator, ...]
+    disturbance: Array
+    nodes: Array
+    gaps: Array
+    breaks: Array
+    timed: bool
+    pace: float
+    varies: tuple[bool, ...]
     low: Array
     high: Array
     limited: Array
@@ -55,13 +93,23 @@ class Setting:
     start_low: Array
     start_high: Array
     horizon: float
-    flow: Callable[[Array], Array]
-    spread: Callable[[Array], Array]
+    flow: Flow
+    spread: Flow
 
     @property
     def dimension(self) -> int:
         """Number of states n."""
         return len(self.noisy)
+
+    @property
+    def changing(self) -> bool:
+        """Whether the generator is more than one operator that lasts."""
+        return len(self.operators) > 1 or self.operators[0].factor is not None
+
+    def moments(self, axis: int | None = None) -> Array:
+        """Times at which f_i or a_ii (or any of them) is looked at."""
+        changes = any(self.varies) if axis is None else self.varies[axis]
+        return np.linspace(0, self.horizon, _MOMENTS) if changes else np.zeros(1)
 
 
 def setting_of(problem: Problem) -> Setting:
@@ -70,69 +118,123 @@ def setting_of(problem: Problem) -> Setting:
     Raises
     ------
     InfeasibleError
-        What is not served yet: disturbances, a model that changes with time, windows, moving or curved sets, random
-        starts, targets; the message says which.
+        What is not served yet: windows, moving or curved sets, random starts, targets, models in which time or
+        disturbances are not apart from the states; the message says which.
     """
     system = problem.system
     if not isinstance(system, ContinuousSystem):
         raise InfeasibleError("values with a carried error need continuous time here; the problem is discrete.")
     served = {
-        "a disturbance": system.disturbance is None, "a target": problem.reach is None, "a random start":
-        not problem.initial.random, "a plan that is an array": problem.input_sequence is None, "an infinite horizon":
-        not problem.endless, "paths that end as they leave the domain": not problem.ending,
+        "a target": problem.reach is None, "a random start": not problem.initial.random, "a plan that is an array":
+        problem.input_sequence is None, "an infinite horizon": not problem.endless,
+        "paths that end as they leave the domain": not problem.ending,
     }  # fmt: skip
     missing = [name for name, there in served.items() if not there]
     if missing:
         raise InfeasibleError(f"values with a carried error do not serve {missing[0]} yet.")
-    n = system.dimension
+    n, horizon = system.dimension, float(problem.horizon)
     room = limits_of(problem)
     square = squared_diffusion(system.diffusion, system.states)
     fields = (Fields(problem.closed_loop, n), Fields(square, n))
-    if not all(one.autonomous for one in fields):
-        raise InfeasibleError("values with a carried error do not serve models that change with time yet.")
+    box = system.disturbance
+    around = np.zeros((2, 0)) if box is None else np.array([box.low, box.high], dtype=float)
+    operators = _operators(problem.closed_loop, square, fields, n)
+    factors = [one.factor for one in operators if one.factor is not None]
+    nodes, gaps = disturbance_nodes(factors, *around)
+    timed = not all(one.autonomous for one in fields)
+    middle = around.mean(axis=0)
+    pace = max(1.0, 1 / (_USUAL_STEPS * pace_of(factors, horizon, middle))) if timed else 1.0
+    read = [*sources(problem.closed_loop), *sources(square)]
     hulls = [start.hull(0.0) for start in problem.starts if not isinstance(start, GaussianStart)]
     start_low, start_high = np.array([h.lo for h in hulls]), np.array([h.hi for h in hulls])
-    flow, spread = _in_floats(problem.closed_loop, n), _in_floats(square, n)
+    flow, spread = _in_floats(problem.closed_loop, n, middle), _in_floats(square, n)
     lows, highs = np.array([room.inner_low, room.outer_low]), np.array([room.inner_high, room.outer_high])
     limited = np.array([np.isfinite(lows[0]), np.isfinite(highs[0])])
-    visited = _visited(problem, start_low, start_high, lows[0], highs[0])
+    visited = _visited(problem, start_low, start_high, lows[0], highs[0], flow, around)
     width = visited[1] - visited[0]
     return Setting(
-        drift=fields[0], square=fields[1], low=np.where(limited[0], lows, visited[0] - _MARGIN * width),
+        drift=fields[0], square=fields[1], operators=operators, disturbance=around, nodes=nodes, gaps=gaps,
+        breaks=clock_breaks([problem.closed_loop, square], horizon) if timed else np.zeros(0), timed=timed, pace=pace,
+        varies=tuple(0 in read[k] | read[n + k * n + k] for k in range(n)),
+        low=np.where(limited[0], lows, visited[0] - _MARGIN * width),
         high=np.where(limited[1], highs, visited[1] + _MARGIN * width), limited=limited,
         noisy=tuple(fields[1].present[k * n + k] for k in range(n)), range=visited,
-        start_low=start_low, start_high=start_high, horizon=float(problem.horizon),
+        start_low=start_low, start_high=start_high, horizon=horizon,
         flow=flow, spread=spread,
     )  # fmt: skip
 
 
-def _in_floats(tape: Tape, n: int) -> Callable[[Array], Array]:
-    """A tape as a function of points, shape (n, ...), to its outputs, shape (outputs, ...)."""
+def _operators(drift: Tape, square: Tape, fields: tuple[Fields, Fields], n: int) -> tuple[Operator, ...]:
+    """The products of drift and noise, the one without a factor first, where there is one."""
+    if fields[0].autonomous and fields[1].autonomous and len(drift.inputs) == n + 1:
+        return (Operator(factor=None, drift=fields[0], square=fields[1]),)
+    parts = separated(drift, n), separated(square, n)
+    if parts[0] is None or parts[1] is None:
+        raise InfeasibleError(
+            "values with a carried error need time and disturbances as factors of functions of the state, as in "
+            "a(t) x + b(t, d), and this model has them inside of such a function."
+        )
+    nothing = [_nothing(tape, n) for tape in (drift, square)]
+    names = drift.inputs[n + 1 :]
+    rows = [(one, None) for one in parts[0]] + [(None, one) for one in parts[1] if one.coefficient is not None]
+    plain = [one for one in parts[1] if one.coefficient is None]
+    result = []
+    for first, second in rows:
+        one = first or second
+        assert one is not None
+        other = second or (plain.pop() if one.coefficient is None and plain else None)
+        result.append(_operator(one.coefficient, first, other, nothing, n, names))
+    result += [_operator(None, None, one, nothing, n, names) for one in plain]
+    return tuple(sorted(result, key=lambda one: one.factor is not None))
+
+
+def _operator(
+    factor: Tape | None, drift: Product | None, square: Product | None, nothing: list[Tape], n: int,
+    names: tuple[str, ...],
+) -> Operator:  # fmt: skip
+    if factor is not None:  # that of the noise has no disturbances
+        factor = replace(factor, inputs=(factor.inputs[0], *names))
+    tapes = [empty if one is None else one.function for one, empty in zip((drift, square), nothing)]
+    return Operator(factor=factor, drift=Fields(tapes[0], n), square=Fields(tapes[1], n))
+
+
+def _nothing(tape: Tape, n: int) -> Tape:
+    graph = Graph(tape.inputs[: n + 1])
+    return graph.tape([graph.const(0.0)] * len(tape.outputs), (len(tape.outputs),))
+
+
+def _in_floats(tape: Tape, n: int, usual: Array | None = None) -> Flow:
+    """A tape as a function of points, a time, and disturbances, which are ``usual`` ones where none are given."""
     function = compile_numpy(tape)
     count = len(tape.outputs)
 
-    def call(points: Array) -> Array:
-        return np.ascontiguousarray(np.moveaxis(function(0.0, *points).reshape(*points.shape[1:], count), -1, 0))
+    def call(points: Array, time: float = 0.0, disturbance: Array | None = usual) -> Array:
+        rest = () if disturbance is None else tuple(disturbance)
+        values = function(time, *points, *rest)
+        return np.ascontiguousarray(np.moveaxis(values.reshape(*points.shape[1:], count), -1, 0))
 
     return call
 
 
-def _visited(problem: Problem, low: Array, high: Array, inner_low: Array, inner_high: Array) -> Array:
-    """Quantiles of where simulated paths are while they are safe, shape (2, n)."""
+def _visited(
+    problem: Problem, low: Array, high: Array, inner_low: Array, inner_high: Array, flow: Flow, disturbance: Array
+) -> Array:
+    """Quantiles of where simulated paths are while they are safe, shape (2, n); each has an extreme disturbance."""
     rng, n = np.random.default_rng(0), problem.system.dimension
     system = problem.system
     assert isinstance(system, ContinuousSystem)
     g = system.diffusion
-    flow = _in_floats(problem.closed_loop, n)
     columns = g.shape[1]
-    noise = _in_floats(g, n) if isinstance(g, Tape) else lambda x: np.asarray(g)[:, :, None].reshape(n * columns, 1)
+    noise = _in_floats(g, n) if isinstance(g, Tape) else lambda x, t: np.asarray(g).reshape(n * columns, 1)
+    extreme = disturbance[rng.integers(2, size=(len(disturbance.T), _PATHS)), np.arange(len(disturbance.T))[:, None]]
     which = rng.integers(len(low), size=_PATHS)
     x = low[which].T + (high - low)[which].T * rng.random((n, _PATHS))
     step, seen = problem.horizon / _STEPS, [x.copy()]
     alive = np.ones(_PATHS, dtype=bool)
     for k in range(_STEPS):
-        kicks = noise(x).reshape(n, columns, -1) * rng.normal(size=(columns, _PATHS))
-        x = x + step * flow(x) + math.sqrt(step) * kicks.sum(axis=1)
+        kicks = noise(x, k * step).reshape(n, columns, -1) * rng.normal(size=(columns, _PATHS))
+        moved = x + step * flow(x, k * step, extreme) + math.sqrt(step) * kicks.sum(axis=1)
+        x = np.where(alive, moved, x)
         alive &= np.all((x > inner_low[:, None]) & (x < inner_high[:, None]), axis=0)
         if k % _EVERY == 0 and alive.any():
             seen.append(x[:, alive])

@@ -15,17 +15,21 @@ from itertools import pairwise
 
 import numpy as np
 
-from certbound.arrays import Array, Mask
+from certbound.arrays import Array, Index, Mask
 from certbound.rigor.intervals import Interval
+from certbound.values.enclosing import enclose
 from certbound.values.kolmogorov.axes import Grazing, plan_axes
 from certbound.values.kolmogorov.box_setting import Setting
-from certbound.values.kolmogorov.face_exits import face_of, shortfall
+from certbound.values.kolmogorov.changing import ChangingEquation
+from certbound.values.kolmogorov.face_exits import ALWAYS, face_of, shortfall
+from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.solve import Discretised, discretised
 from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
+_AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
 _MARGIN = 0.1  # by which a source exceeds what it pays for
 _LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
@@ -44,23 +48,52 @@ def ramp(y: Array) -> Array:
 
 def time_steps(horizon: float, count: int, layer: float) -> Array:
     """Lengths of the steps from the end backward: small in the end layer, growing to horizon / count."""
-    largest, step = horizon / count, layer / _FIRST
+    return _graded(horizon, horizon / count, layer / _FIRST, _GROWTH)
+
+
+def _graded(length: float, largest: float, first: float, growth: float) -> Array:
+    step = first
     result: list[float] = []
-    while step < largest and sum(result) + step < horizon:
+    while step < largest and sum(result) + step < length:
         result.append(step)
-        step *= _GROWTH
-    rest = horizon - sum(result)
+        step *= growth
+    rest = length - sum(result)
     more = max(int(np.ceil(rest / largest)), 1)
     return np.array(result + [rest / more] * more)
 
 
+def knots_of(horizon: float, count: int, layer: float, breaks: Array) -> Array:
+    """Times of the knots, from the horizon back to 0: as `time_steps`, with two about every break.
+
+    Before a break, backward in time, a solution that does not fit the new coefficients at faces has a layer in time.
+    """
+    half, largest = HALF * horizon, horizon / count
+    ends = horizon - np.append(breaks[::-1], 0.0)  # passed, backward
+    passed = [0.0]
+    for k, end in enumerate(ends):
+        last = end - half if k < len(breaks) else end
+        first, growth = (layer / _FIRST, _GROWTH) if k == 0 else (layer * _AFTER, _QUICKER)
+        begin = passed[-1]
+        passed += list(begin + np.cumsum(_graded(last - begin, largest, first, growth)))
+        passed[-1] = last
+        if k < len(breaks):
+            passed.append(end + half)
+    times = horizon - np.array(passed)
+    times[-1] = 0.0
+    return np.asarray(times)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Mesh:
-    """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis)."""
+    """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis).
+
+    ``inside`` holds the points of the box nearest to the nodes.
+    """
 
     nodes: tuple[Array, ...]
     pad: tuple[tuple[int, int], ...]
-    equation: Discretised
+    inside: Array
+    equation: Discretised | ChangingEquation
     layer: Array
     at_limit: Mask
     rate: Array
@@ -87,15 +120,17 @@ def mesh_of(
     shape = points.shape[1:]
     inside = np.clip(points, low.reshape(-1, *[1] * n), high.reshape(-1, *[1] * n))
     flow, spread = setting.flow(inside), setting.spread(inside).reshape(n, n, *shape)
+    least, most, noise = _extremes(setting, inside, flow, spread) if setting.changing else (flow, flow, spread)
+    size, slowest = np.maximum(most, -least), np.clip(0, least, most)
     dead, at_limit, layer, rate = np.zeros(shape, bool), np.zeros(shape, bool), np.ones(shape), np.zeros(shape)
     for i in range(n):
         for side, place in ((0, 0), (1, shape[i] - 1)):
             face = tuple(place if k == i else slice(None) for k in range(n))
-            out = (2 * side - 1) * flow[i][face]
-            leaves = (spread[i, i][face] > 0) | (out >= 0)
+            out = most[i][face] if side else -least[i][face]
+            leaves = (noise[i, i][face] > 0) | (out >= 0)
             dead[face] |= leaves
             at_limit[face] |= leaves & bool(setting.limited[side, i])
-            width = np.sqrt(spread[i, i][face].max() * span) or np.maximum(out, 0).mean() * span
+            width = np.sqrt(max(noise[i, i][face].max(), 0.0) * span) or np.maximum(out, 0).mean() * span
             third = abs(lines[i][place] - lines[i][3 if side == 0 else -4])
             layer = layer * ramp(np.abs(points[i] - lines[i][place]) / max(width, third))
     for i in range(n):
@@ -104,20 +139,36 @@ def mesh_of(
                 edge = (low, high)[side][i]
                 out = (2 * side - 1) * (points[i] - edge)
                 beyond = abs(lines[i][-1 if side else 0] - edge)
-                speed = np.abs(flow[i]) / beyond + spread[i, i] / beyond**2
+                speed = size[i] / beyond + noise[i, i] / beyond**2
                 rate += _KILL * speed * ramp(out / beyond)
     for one in grazing:
         edge = (low, high)[one.side][one.axis]
         out = (2 * one.side - 1) * (points[one.axis] - edge)
         if pads[one.axis][one.side]:
             beyond = abs(lines[one.axis][-1 if one.side else 0] - edge)
-            rate += _KILL * np.abs(flow[one.axis]).max() / beyond * ramp(out / beyond)
+            rate += _KILL * size[one.axis].max() / beyond * ramp(out / beyond)
         if kill:
             width = (0.3 * _SOFT**3 + 2) * one.scale
-            rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(flow[one.axis] / (_SOFT * one.speed))
+            rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(slowest[one.axis] / (_SOFT * one.speed))
     layer[dead] = 0
-    equation = discretised(lines, flow, spread, dead, rate)
-    return Mesh(nodes=lines, pad=pads, equation=equation, layer=layer, at_limit=at_limit, rate=rate)
+    equation: Discretised | ChangingEquation = (
+        ChangingEquation(lines, dead, rate, setting.noisy) if setting.changing
+        else discretised(lines, flow, spread, dead, rate)
+    )  # fmt: skip
+    return Mesh(
+        nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, at_limit=at_limit, rate=rate
+    )  # fmt: skip
+
+
+def _extremes(setting: Setting, points: Array, flow: Array, spread: Array) -> tuple[Array, Array, Array]:
+    """Least and largest f and largest a over moments and disturbances."""
+    least, most, noise = flow, flow, spread
+    for time in setting.moments():
+        for acting in setting.nodes:
+            one = setting.flow(points, time, acting)
+            least, most = np.minimum(least, one), np.maximum(most, one)
+        noise = np.maximum(noise, setting.spread(points, time).reshape(spread.shape))
+    return least, most, noise
 
 
 def _bump(y: Array) -> Array:
@@ -160,19 +211,81 @@ class Side:
         self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer)
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
         self.steps = time_steps(setting.horizon * longer, steps, self.layer)
-        everywhere = Interval.point(0.0)
-        self.generator = Generator.of(
-            self.axes, setting.drift.on(self.axes, everywhere), setting.square.on(self.axes, everywhere)
-        )
+        self._follow_changes(int(np.ceil(setting.pace * steps)))
+        products = ((one.drift.on(self.axes, ALWAYS), one.square.on(self.axes, ALWAYS)) for one in setting.operators)
+        self.generator = Generator.of(self.axes, *products)
         self.maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.mesh.nodes)]
         self.carried_maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.carrier.nodes)]
         n, noisy = setting.dimension, setting.noisy
+        slabs = self._slabs() if setting.timed else ALWAYS
+        every = [Interval(a, b) for a, b in setting.disturbance.T]
         self.faces = [
-            face_of(self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])))
+            face_of(
+                self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])), slabs, every
+            )
             for i in range(n) for side in (0, 1)
-        ]
+        ]  # fmt: skip
         self.values: list[Array] = []
         self.rates: list[Array] = []
+        self.policy: list[Index | None] = []
+
+    def _follow_changes(self, steps: int) -> None:
+        """Knots, and what is known of the factors between them, where the generator changes."""
+        setting, horizon = self.setting, self.setting.horizon
+        self.brief = np.zeros(len(self.steps), dtype=bool)  # slabs about breaks: too short to be carried
+        self.clock: Array | None = None
+        self.times = horizon - np.append(0.0, np.cumsum(self.steps))
+        if setting.timed:
+            self.times = knots_of(horizon, steps, self.layer, setting.breaks)
+            self.steps = -np.diff(self.times)
+            self.brief = self.steps < 4 * HALF * horizon
+            self.clock = 2 * CLOCK * horizon / self.steps
+        self.factors = [
+            None if one.factor is None else factor_of(one.factor, self.times, horizon, setting.nodes, setting.gaps)
+            for one in setting.operators
+        ]
+        if setting.changing:  # that no factor hides where the model is undefined
+            ends = [axis.nodes for axis in self.axes]
+            lines = [np.meshgrid(*rows, indexing="ij", sparse=True) for rows in zip(*((e[:-1], e[1:]) for e in ends))]
+            cells = [Interval(low, high) for low, high in zip(*lines)]
+            whole = Interval(0.0, horizon)
+            enclose(setting.drift.tape, [whole, *cells, *(Interval(a, b) for a, b in setting.disturbance.T)])
+            enclose(setting.square.tape, [whole, *cells])
+
+    def _slabs(self) -> Interval:
+        """Times that hold the slabs."""
+        horizon = self.setting.horizon
+        off = CLOCK * horizon
+        return Interval(np.maximum(self.times[1:] - off, 0), np.minimum(self.times[:-1] + off, horizon))
+
+    def _now(self, mesh: Mesh, k: int, a: Array | None = None) -> None:
+        """Set an equation to knot ``k``; with the survival ``a``, choose the worst disturbances there from it."""
+        equation, setting = mesh.equation, self.setting
+        if not isinstance(equation, ChangingEquation):
+            return
+        n, time = setting.dimension, float(self.times[k])
+        if a is not None and len(self.policy) == k:
+            self.policy.append(self._worst(mesh, time, a) if len(setting.nodes) > 1 else None)
+        chosen = self.policy[k]
+        if chosen is not None and chosen.shape != equation.shape:
+            around = [(p - q, r - s) for (p, r), (q, s) in zip(mesh.pad, self.mesh.pad)]
+            chosen = np.pad(chosen, around, mode="edge")
+        acting = setting.nodes[0] if chosen is None else np.moveaxis(setting.nodes[chosen], -1, 0)
+
+        def coefficients(time: float) -> tuple[Array, Array]:
+            spread = setting.spread(mesh.inside, time).reshape(n, n, *equation.shape)
+            return setting.flow(mesh.inside, time, acting), spread
+
+        equation.now(time, coefficients)
+
+    def _worst(self, mesh: Mesh, time: float, a: Array) -> Index:
+        """Of the disturbances' nodes, at each node of the mesh, the one that lowers survival most."""
+        slopes = np.gradient(a, *mesh.nodes)
+        loss = [
+            -sum(f * slope for f, slope in zip(self.setting.flow(mesh.inside, time, acting), slopes))
+            for acting in self.setting.nodes
+        ]
+        return np.asarray(np.argmax(loss, axis=0), dtype=np.intp)
 
     @property
     def work(self) -> int:
@@ -208,10 +321,13 @@ class Side:
 
         a = self.mesh.layer.copy() if above else np.ones(equation.shape)
         tau = 0.0
+        self._now(self.mesh, 0, a)
         self._keep(a, equation.speed(a, 0.0, fall(tau)))
-        for step in self.steps:
-            a = equation.step(a, step, _nothing, partial(_later, fall, tau, step))
+        for k, step in enumerate(self.steps):
+            if not self.brief[k]:
+                a = equation.step(a, step, _nothing, partial(_later, fall, tau, step))
             tau += step
+            self._now(self.mesh, k + 1, a)
             self._keep(a, equation.speed(a, 0.0, fall(tau)))
 
     def _keep(self, a: Array, speed: Array) -> None:
@@ -229,7 +345,9 @@ class Side:
     def _bounded(self, begin: int, end: int) -> list[Array]:
         steps = self.steps[begin:end]
         values, rates = (np.array(rows[begin : begin + len(steps) + 1]) for rows in (self.values, self.rates))
-        bound = residual_bound(self.generator, values, rates, steps)
+        factors = [None if one is None else one.on(slice(begin, end)) for one in self.factors]
+        clock = None if self.clock is None else self.clock[begin:end]
+        bound = residual_bound(self.generator, values, rates, steps, factors, worst=self.above, clock=clock)
         return list(np.where(self._decided(values, rates, steps), 0.0, np.maximum(bound, 0.0)))
 
     def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:
@@ -244,14 +362,18 @@ class Side:
     def correct(self, residuals: list[Array]) -> None:
         """Solve for the error that the residuals leave, and for what v lacks at exits and at the end; add it to v."""
         equation = self.carrier.equation
+        residuals = [np.zeros_like(r) if brief else r for r, brief in zip(residuals, self.brief)]
         slabs = [self._spread(r) + b for r, b in zip(residuals, self._at_exits())]
         ends = [slabs[0], *(np.maximum(p, q) for p, q in pairwise(slabs)), slabs[-1]]
         ends = [(1 + _MARGIN) * s * equation.live for s in ends]
         missing = (1 + _MARGIN) * self._spread(self.shortfall_at_end()) * equation.live
+        self._now(self.carrier, 0)
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
         self._add(0, e, equation.speed(e, ends[0]))
         for k, step in enumerate(self.steps):
-            e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
+            if not self.brief[k]:
+                e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
+            self._now(self.carrier, k + 1)
             self._add(k + 1, e, equation.speed(e, ends[k + 1]))
 
     def _at_exits(self) -> list[Array]:

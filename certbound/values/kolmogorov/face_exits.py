@@ -13,6 +13,9 @@ from certbound.values.enclosing import enclose
 from certbound.values.kolmogorov.cell_fields import Fields
 from certbound.values.kolmogorov.splines import Axis, most_on_cells
 
+ALWAYS = Interval.point(0.0)
+"""The time where nothing changes with it."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Face:
@@ -22,8 +25,9 @@ class Face:
     ----------
     axis, side : int
         Which coordinate, and whether its lower (0) or upper (1) end.
-    leaves : ndarray of bool, shape (N_1, ...) without that axis
-        Face cells through which a path may leave: noise crosses, or the drift points outward or along the face.
+    leaves : ndarray of bool, shape (N_1, ...) without that axis, or (slabs, N_1, ...)
+        Face cells through which a path may leave: noise crosses, or the drift may point outward or along the face, at
+        some time of the slab and for some disturbance.
     goal : float
         What is asked of v there.
     """
@@ -34,8 +38,14 @@ class Face:
     goal: float
 
 
-def face_of(axes: Sequence[Axis], drift: Fields, noisy: bool, axis: int, side: int, goal: float) -> Face:
-    """The face, with the cells where paths can leave by outward-rounded enclosures of the drift on and before it."""
+def face_of(
+    axes: Sequence[Axis], drift: Fields, noisy: bool, axis: int, side: int, goal: float,
+    time: Interval = ALWAYS, disturbance: Sequence[Interval] = (),
+) -> Face:  # fmt: skip
+    """The face, with the cells where paths can leave by outward-rounded enclosures of the drift on and before it.
+
+    ``time`` holds an interval for each slab where the drift changes with it, shape (slabs,).
+    """
     others = [one for k, one in enumerate(axes) if k != axis]
     shape = tuple(one.cells for one in others)
     if noisy:
@@ -46,8 +56,10 @@ def face_of(axes: Sequence[Axis], drift: Fields, noisy: bool, axis: int, side: i
     boxes = [Interval(low, high) for low, high in zip(lows, highs)]
     inward = float(np.nextafter(place, np.inf if side == 0 else -np.inf))  # the drift may jump on the face
     boxes.insert(axis, Interval(min(place, inward), max(place, inward)))
-    values, _ = enclose(drift.tape, [Interval.point(0.0), *boxes])
-    across = values[axis].broadcast_to(shape)
+    slabs = time.shape
+    time = time.reshape(*slabs, *[1] * len(axes[1:])) if slabs else time
+    values, _ = enclose(drift.tape, [time, *boxes, *disturbance])
+    across = values[axis].broadcast_to((*slabs, *shape))
     leaves = across.hi >= 0 if side else across.lo <= 0
     return Face(axis=axis, side=side, leaves=np.asarray(leaves), goal=goal)
 
