@@ -12,7 +12,7 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Graph, Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart
+from certbound.problem.sets import GaussianStart, Region
 from certbound.problem.systems import ContinuousSystem
 from certbound.values.enclosing import squared_diffusion
 from certbound.values.kolmogorov.cell_fields import Fields
@@ -23,6 +23,7 @@ from certbound.values.room import limits_of
 _PATHS, _STEPS, _EVERY = 2000, 400, 10
 _RARE = 2e-4  # share of the visits that lies beyond the range on either side
 _MARGIN = 0.4  # of the range, beyond it, where no limit stands
+_DEVIATIONS = 3.5  # of a normal start, which belong to the range
 _MOMENTS = 7  # times at which an axis looks at a model that changes
 _USUAL_STEPS = 40.0  # over the horizon where nothing changes with time, on the coarsest grid
 
@@ -118,16 +119,15 @@ def setting_of(problem: Problem) -> Setting:
     Raises
     ------
     InfeasibleError
-        What is not served yet: windows, moving or curved sets, random starts, targets, models in which time or
+        What is not served yet: windows, moving or curved sets, targets, models in which time or
         disturbances are not apart from the states; the message says which.
     """
     system = problem.system
     if not isinstance(system, ContinuousSystem):
         raise InfeasibleError("values with a carried error need continuous time here; the problem is discrete.")
     served = {
-        "a target": problem.reach is None, "a random start": not problem.initial.random, "a plan that is an array":
-        problem.input_sequence is None, "an infinite horizon": not problem.endless,
-        "paths that end as they leave the domain": not problem.ending,
+        "a target": problem.reach is None, "a plan that is an array": problem.input_sequence is None,
+        "an infinite horizon": not problem.endless, "paths that end as they leave the domain": not problem.ending,
     }  # fmt: skip
     missing = [name for name, there in served.items() if not there]
     if missing:
@@ -145,8 +145,7 @@ def setting_of(problem: Problem) -> Setting:
     middle = around.mean(axis=0)
     pace = max(1.0, 1 / (_USUAL_STEPS * pace_of(factors, horizon, middle))) if timed else 1.0
     read = [*sources(problem.closed_loop), *sources(square)]
-    hulls = [start.hull(0.0) for start in problem.starts if not isinstance(start, GaussianStart)]
-    start_low, start_high = np.array([h.lo for h in hulls]), np.array([h.hi for h in hulls])
+    start_low, start_high = (np.array(rows) for rows in zip(*(_around(start) for start in problem.starts)))
     flow, spread = _in_floats(problem.closed_loop, n, middle), _in_floats(square, n)
     lows, highs = np.array([room.inner_low, room.outer_low]), np.array([room.inner_high, room.outer_high])
     limited = np.array([np.isfinite(lows[0]), np.isfinite(highs[0])])
@@ -162,6 +161,15 @@ def setting_of(problem: Problem) -> Setting:
         start_low=start_low, start_high=start_high, horizon=horizon,
         flow=flow, spread=spread,
     )  # fmt: skip
+
+
+def _around(start: Region | GaussianStart) -> tuple[Array, Array]:
+    """The ends of a box around a start set, or around nearly all of a normal start."""
+    if isinstance(start, GaussianStart):
+        size = _DEVIATIONS * np.sqrt(np.diag(start.covariance))
+        return start.middle - size, start.middle + size
+    hull = start.hull(0.0)
+    return np.asarray(hull.lo, dtype=float), np.asarray(hull.hi, dtype=float)
 
 
 def _operators(drift: Tape, square: Tape, fields: tuple[Fields, Fields], n: int) -> tuple[Operator, ...]:
@@ -229,6 +237,10 @@ def _visited(
     extreme = disturbance[rng.integers(2, size=(len(disturbance.T), _PATHS)), np.arange(len(disturbance.T))[:, None]]
     which = rng.integers(len(low), size=_PATHS)
     x = low[which].T + (high - low)[which].T * rng.random((n, _PATHS))
+    for k, start in enumerate(problem.starts):
+        if isinstance(start, GaussianStart):
+            x[:, which == k] = start.sample(rng, int((which == k).sum())).T
+    low, high = np.clip(low, inner_low, inner_high), np.clip(high, inner_low, inner_high)
     step, seen = problem.horizon / _STEPS, [x.copy()]
     alive = np.ones(_PATHS, dtype=bool)
     for k in range(_STEPS):

@@ -30,6 +30,7 @@ from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_de
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
 _AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
+_OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
 _MARGIN = 0.1  # by which a source exceeds what it pays for
 _LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
@@ -289,8 +290,9 @@ class Side:
 
     @property
     def work(self) -> int:
-        """Cells of space and time."""
-        return int(np.prod([axis.cells for axis in self.axes])) * len(self.steps)
+        """Cells of space and time, each as often as it costs one of a model that does not change."""
+        times = _OFTEN[0] + _OFTEN[1] * len(self.setting.nodes) if self.setting.changing else 1.0
+        return int(times * np.prod([axis.cells for axis in self.axes]) * len(self.steps))
 
     @property
     def finite(self) -> bool:

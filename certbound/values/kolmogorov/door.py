@@ -16,6 +16,7 @@ from certbound.problem.sets import GaussianStart
 from certbound.values.kolmogorov.box_setting import Setting, setting_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
+from certbound.values.kolmogorov.start_law import StartMean
 from certbound.watch import poll
 
 _COARSEST = {2: 0.06, 3: 0.07}  # cell of the first grid, as a share of the range
@@ -91,7 +92,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     starts, cell = starts_in(problem), _COARSEST[setting.dimension]
     budget = seconds * RATE[setting.dimension]
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
-    sides: tuple[bool, ...] = (True, False)
+    sides: tuple[bool, ...] = (True,) if problem.unknown else (True, False)  # constants are no worst disturbance
     while True:
         before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
@@ -122,7 +123,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
             needed = (carried / max(room, 1e-300)) ** ((setting.dimension + 1) / _ORDER)
             growth = max(min(growth, needed), _LEAST)
             growth = min(growth * len(sides), _GROWTH)
-            sides = (estimate < delta,)
+            sides = (estimate < delta or bool(problem.unknown),)
         cell /= growth ** (1 / (setting.dimension + 1))
 
 
@@ -150,18 +151,28 @@ def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Starts:
-    """Boxes around the starts, and points that surely are starts, shapes (S, n) and (P, n)."""
+    """Boxes around the starts, points that surely are starts, shapes (S, n) and (P, n), and normal starts."""
 
     low: Array
     high: Array
     points: Array
+    means: tuple[StartMean, ...] = ()
 
 
 def starts_in(problem: Problem) -> Starts:
-    lows, highs, points = [], [], []
+    n = problem.system.dimension
+    means: list[StartMean] = []
+    lows: list[Array] = []
+    highs: list[Array] = []
+    points: list[Array] = []
     for start in problem.starts:
+        if isinstance(start, GaussianStart) and start.spread:
+            means.append(StartMean(start))
+            continue
         if isinstance(start, GaussianStart):
-            raise InfeasibleError("values with a carried error do not serve random starts yet.")
+            for rows in (lows, highs, points):
+                rows.append(start.middle)
+            continue
         hull = start.hull(0.0)
         low, high = np.asarray(hull.lo, dtype=float), np.asarray(hull.hi, dtype=float)
         lows.append(low)
@@ -172,15 +183,25 @@ def starts_in(problem: Problem) -> Starts:
             point = middle + np.array(share) * (high - low) / 2 * (1 - 1e-9)
             if start.contains(point):
                 points.append(point)
-    return Starts(low=np.array(lows), high=np.array(highs), points=np.array(points))
+    low, high, within = (np.array(rows).reshape(-1, n) for rows in (lows, highs, points))
+    return Starts(low=low, high=high, points=within, means=tuple(means))
 
 
 def largest_at_start(side: Side, starts: Starts) -> tuple[float, float]:
     """v(0, .) over the starts: roughly at the worst of them, and the certified number of the side.
 
     From above that is an upper bound over all starts; from below the least of v over some of them, rounded up. Of
-    starts beyond the box of the axes, where v is not known, 1 is said from above and 0 from below.
+    starts beyond the box of the axes, where v is not known, 1 is said from above and 0 from below. Of a normal start it
+    is the mean.
     """
+    found = [mean.bound(side) for mean in starts.means]
+    if len(starts.low):
+        found.append(_largest_of_sets(side, starts))
+    pick = max if side.above else min
+    return pick(rough for rough, _ in found), pick(bound for _, bound in found)
+
+
+def _largest_of_sets(side: Side, starts: Starts) -> tuple[float, float]:
     coefficients = side.values[-1]
     ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
     if not side.above:

@@ -188,8 +188,8 @@ def test_the_residual_of_a_random_function_lies_below_its_bound_at_all_times(nam
                 assert seen[:, own].max(axis=1).min() <= max(bounds[k][cell], 0) + 1e-9 * np.abs(seen).max()
 
 
-def survival(model: object, disturbed: bool, nodes: int = 401, steps: int = 1600) -> float:
-    """Of one state from 0.2 within [-1, 1] up to 2, by Crank and Nicolson's scheme after a few implicit steps."""
+def survival(model: object, disturbed: bool = False, nodes: int = 401, steps: int = 1600) -> np.ndarray:
+    """Of one state within [-1, 1] up to 2, at starts on a line, by Crank and Nicolson after a few implicit steps."""
     x, h = np.linspace(-1, 1, nodes), 2.0 / steps
     gap, a = x[1] - x[0], np.where(np.abs(x) < 1, 1.0, 0.0)
     for k in range(steps):
@@ -201,7 +201,7 @@ def survival(model: object, disturbed: bool, nodes: int = 401, steps: int = 1600
         right = a + (1 - share) * h * (up * np.roll(a, -1) + down * np.roll(a, 1) - (up + down) * a)
         rows = np.array([np.roll(-share * h * up, 1), 1 + share * h * (up + down), np.roll(-share * h * down, -1)])
         a = solve_banded((1, 1), rows, right)
-    return float(np.interp(0.2, x, a))
+    return a
 
 
 def two_apart(model: object, disturbed: bool = False) -> tuple[cb.Problem, float]:
@@ -216,7 +216,8 @@ def two_apart(model: object, disturbed: bool = False) -> tuple[cb.Problem, float
             lambda t, x: [model(t, x[0]), model(t, x[1])], states=2, diffusion=0.5 * np.eye(2)
         )  # fmt: skip
     asked = cb.Problem(two, initial=[0.2, 0.2], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2.0)
-    return asked, 1 - survival(model, disturbed) * survival(model, False)
+    first, second = (float(np.interp(0.2, np.linspace(-1, 1, 401), survival(model, one))) for one in (disturbed, False))
+    return asked, 1 - first * second
 
 
 TIMED = {
