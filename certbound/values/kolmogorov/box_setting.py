@@ -17,7 +17,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.values.enclosing import squared_diffusion
 from certbound.values.kolmogorov.cell_fields import Fields
 from certbound.values.kolmogorov.factors import clock_breaks, disturbance_nodes, pace_of
-from certbound.values.kolmogorov.separation import Product, separated
+from certbound.values.kolmogorov.products import Product, separated
 from certbound.values.room import limits_of
 
 _PATHS, _STEPS, _EVERY = 2000, 400, 10

@@ -13,13 +13,10 @@ import numpy as np
 
 from certbound.arrays import Array, Mask
 from certbound.values.kolmogorov.solve import (
-    _CENTRAL,
-    _DIAGONAL,
-    _MIXED,
-    _SHARES,
-    _STAGE,
-    _WEIGHTS,
+    CENTRAL,
     NOISE,
+    SPLIT_DIAGONAL,
+    SPLIT_METHOD,
     Discretised,
     Source,
     banded,
@@ -64,16 +61,15 @@ class ChangingEquation:
         self.dead, self.rate = dead, rate * self.live
         self.first = [tuple(map(banded, upwind(line, one))) for line, one in zip(nodes, noisy)]
         self.second = [banded(difference(line, NOISE if len(nodes) < 3 else NOISE[-1:], 2)) for line in nodes]
-        self.central = [banded(difference(line, _CENTRAL, 1)) for line in nodes]
+        self.central = [banded(difference(line, CENTRAL, 1)) for line in nodes]
         self.coefficients: Coefficients | None = None
         self.time = 0.0
         self.frozen: tuple[Discretised, Array, Array] | None = None
         self.kept: dict[float, tuple[Discretised, Array, Array]] = {}
         self.known: dict[float, tuple[Array, Array]] = {}
         accurate = len(nodes) < 3
-        usual = (_STAGE, _MIXED, _WEIGHTS, np.array([float(_STAGE[i, :i] @ _SHARES[:i]) for i in range(4)]))
-        self.method = _in_solves(*map(np.array, _ACCURATE)) if accurate else usual
-        self.diagonal = _G if accurate else _DIAGONAL
+        self.method = _in_solves(*map(np.array, _ACCURATE)) if accurate else SPLIT_METHOD
+        self.diagonal = _G if accurate else SPLIT_DIAGONAL
         gaps = [np.minimum(np.append(np.diff(line), np.inf), np.append(np.inf, np.diff(line))) for line in nodes]
         self.gaps = [gap.reshape([-1 if k == i else 1 for k in range(len(nodes))]) for i, gap in enumerate(gaps)]
 

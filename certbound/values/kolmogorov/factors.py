@@ -21,8 +21,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import EnclosureError, InfeasibleError
-from certbound.problem.model import JUMPS, ROWS, Tape, compile_numpy, is_zero, jacobian, selected
-from certbound.problem.model.analysis import reads
+from certbound.problem.model import JUMPS, ROWS, Tape, compile_numpy, is_zero, jacobian, reads, selected
 from certbound.rigor.intervals import Interval
 from certbound.values.enclosing import enclose
 from certbound.values.kolmogorov.splines import Sampling

@@ -17,7 +17,7 @@ noise replaced by their own interpolants (`cell_fields`), whose errors are paid 
 
 and d_i^(m+1) r_j is bounded term by term: d^(m+1) (F D) = sum_k binomial(m + 1, k) d^k F d^(m+1-k) D, d^(m+1) F = 0.
 
-Where L = sum_g c_g(t, d) L_g (`separation`), each c_g is a polynomial of degree q in the share of the slab, but for an
+Where L = sum_g c_g(t, d) L_g (`products`), each c_g is a polynomial of degree q in the share of the slab, but for an
 error (`factors`). Then r has degree 3 + q, with coefficients
 
     r_k = (v_t)_k + sum_g sum_{i+j=k} binomial(q, i) binomial(3, j) / binomial(3 + q, k) c_gi L_g b_j,

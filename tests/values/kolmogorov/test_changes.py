@@ -14,7 +14,7 @@ from certbound.values.kolmogorov.box_setting import Setting, setting_of
 from certbound.values.kolmogorov.carry import Side, knots_of
 from certbound.values.kolmogorov.door import refined, starts_in
 from certbound.values.kolmogorov.factors import HALF, clock_breaks, disturbance_nodes, factor_of
-from certbound.values.kolmogorov.separation import separated
+from certbound.values.kolmogorov.products import separated
 
 MODELS = {
     "a forced oscillator": lambda t, x, d: [x[1], -x[0] - 0.3 * x[1] + 0.4 * np.cos(2 * t) + d[0]],

@@ -13,8 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from certbound.problem.model import JUMPS, PARTS, ROWS, Graph, Node, Tape, is_zero, jacobian, selected, sources
-from certbound.problem.model.analysis import reads
+from certbound.problem.model import JUMPS, PARTS, ROWS, Graph, Node, Tape, is_zero, jacobian, reads, selected, sources
 
 _DEGREE = 4  # largest power of a parameter
 _MOST = 40  # products
