@@ -8,8 +8,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -36,11 +37,30 @@ class Grazing:
     scale: float
 
 
-def plan_axes(setting: Setting, cell: Array, row: int) -> tuple[list[Array], list[Grazing]]:
-    """Nodes of each axis, and where paths graze.
+def plan_axes(stages: Sequence[Setting], cell: Array, row: int) -> list[tuple[list[Array], list[Grazing]]]:
+    """Nodes of each axis, and where paths graze, for each stage; stages have the nodes in common that both hold.
 
     ``cell`` holds a share of the range for each axis; ``row`` says which ends of the box are meant (0: the inner ones).
     """
+    planned = [_sizes(one, cell, row) for one in stages]
+    lines = []
+    for i in range(stages[0].dimension):
+        ends = [float(end) for one in stages for rows in (one.low, one.high, one.due_low, one.due_high)
+                for end in rows[row, i : i + 1] if np.isfinite(end)]  # fmt: skip
+        cuts = np.unique(ends)
+        cuts = cuts[(cuts >= min(float(one.low[row, i]) for one in stages))
+                    & (cuts <= max(float(one.high[row, i]) for one in stages))]  # fmt: skip
+        sizes = [size for own, _ in planned for size in own[i]]
+        parts = [_nodes(low, high, sizes) for low, high in pairwise(cuts)]
+        lines.append(np.unique(np.concatenate(parts)))
+    return [
+        ([line[(line >= one.low[row, i]) & (line <= one.high[row, i])] for i, line in enumerate(lines)], grazing)
+        for one, (_, grazing) in zip(stages, planned)
+    ]  # fmt: skip
+
+
+def _sizes(setting: Setting, cell: Array, row: int) -> tuple[list[list[Size]], list[Grazing]]:
+    """What cells along each axis are to be, and where paths graze."""
     low, high = setting.low[row], setting.high[row]
     width = setting.range[1] - setting.range[0]
     cell = np.broadcast_to(cell, width.shape)
@@ -58,7 +78,10 @@ def plan_axes(setting: Setting, cell: Array, row: int) -> tuple[list[Array], lis
                     sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
                 else:
                     grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place, time)
-    return [_nodes(low[i], high[i], sizes[i]) for i in range(n)], grazing
+        for place in (setting.due_low[row, i], setting.due_high[row, i]):
+            if np.isfinite(place):
+                sizes[i].append(_toward(float(place), _SMALLEST * cell[i] * width[i]))
+    return sizes, grazing
 
 
 def _inner(size: float, low: float, high: float) -> Size:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -12,13 +13,14 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Graph, Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
-from certbound.problem.sets import GaussianStart, Region
+from certbound.problem.sets import GaussianStart, Inside, Region
 from certbound.problem.systems import ContinuousSystem
 from certbound.values.enclosing import squared_diffusion
 from certbound.values.kolmogorov.cell_fields import Fields
-from certbound.values.kolmogorov.factors import clock_breaks, disturbance_nodes, pace_of
+from certbound.values.kolmogorov.factors import HALF, clock_breaks, disturbance_nodes, pace_of
 from certbound.values.kolmogorov.products import Product, separated
-from certbound.values.room import limits_of
+from certbound.values.room import limits_among
+from certbound.values.sets import as_stays
 
 _PATHS, _STEPS, _EVERY = 2000, 400, 10
 _RARE = 2e-4  # share of the visits that lies beyond the range on either side
@@ -43,6 +45,8 @@ class Operator:
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Setting:
     """A problem in a box: dX = f(t, X, d) dt + g(t, X) dW, limits along the coordinates, one start set.
+
+    Where limits are due in windows, it is one of the stages between the times at which they change.
 
     Attributes
     ----------
@@ -73,7 +77,12 @@ class Setting:
         Between these ends paths spend nearly all their time.
     start_low, start_high : ndarray, shape (starts, n)
         A box around each start set.
-    horizon : float
+    begin, horizon : float
+        The times between which it is meant.
+    staged : bool
+        Whether there are more stages, or limits that are due at the end alone.
+    due_low, due_high : ndarray, shape (2, n)
+        Limits that are due at the end of the stage alone, rounded as ``low`` and ``high``; infinite for none.
     """
 
     drift: Fields
@@ -93,7 +102,11 @@ class Setting:
     range: Array
     start_low: Array
     start_high: Array
+    begin: float
     horizon: float
+    staged: bool
+    due_low: Array
+    due_high: Array
     flow: Flow
     spread: Flow
 
@@ -110,17 +123,23 @@ class Setting:
     def moments(self, axis: int | None = None) -> Array:
         """Times at which f_i or a_ii (or any of them) is looked at."""
         changes = any(self.varies) if axis is None else self.varies[axis]
-        return np.linspace(0, self.horizon, _MOMENTS) if changes else np.zeros(1)
+        return np.linspace(self.begin, self.horizon, _MOMENTS) if changes else np.zeros(1)
 
 
 def setting_of(problem: Problem) -> Setting:
-    """Read a problem.
+    """A problem without windows, as `stages_of` reads it."""
+    (one,) = stages_of(problem)
+    return one
+
+
+def stages_of(problem: Problem) -> list[Setting]:
+    """Read a problem: one setting for each stage of time between changes of its limits, in their order.
 
     Raises
     ------
     InfeasibleError
-        What is not served yet: windows, moving or curved sets, targets, models in which time or
-        disturbances are not apart from the states; the message says which.
+        What is not served yet: moving or curved sets, targets, models in which time or disturbances are not apart from
+        the states; the message says which.
     """
     system = problem.system
     if not isinstance(system, ContinuousSystem):
@@ -133,7 +152,7 @@ def setting_of(problem: Problem) -> Setting:
     if missing:
         raise InfeasibleError(f"values with a carried error do not serve {missing[0]} yet.")
     n, horizon = system.dimension, float(problem.horizon)
-    room = limits_of(problem)
+    ends, rooms, dues = _windows(problem)
     square = squared_diffusion(system.diffusion, system.states)
     fields = (Fields(problem.closed_loop, n), Fields(square, n))
     box = system.disturbance
@@ -147,20 +166,67 @@ def setting_of(problem: Problem) -> Setting:
     read = [*sources(problem.closed_loop), *sources(square)]
     start_low, start_high = (np.array(rows) for rows in zip(*(_around(start) for start in problem.starts)))
     flow, spread = _in_floats(problem.closed_loop, n, middle), _in_floats(square, n)
-    lows, highs = np.array([room.inner_low, room.outer_low]), np.array([room.inner_high, room.outer_high])
-    limited = np.array([np.isfinite(lows[0]), np.isfinite(highs[0])])
-    visited = _visited(problem, start_low, start_high, lows[0], highs[0], flow, around)
-    width = visited[1] - visited[0]
-    return Setting(
-        drift=fields[0], square=fields[1], operators=operators, disturbance=around, nodes=nodes, gaps=gaps,
-        breaks=clock_breaks([problem.closed_loop, square], horizon) if timed else np.zeros(0), timed=timed, pace=pace,
-        varies=tuple(0 in read[k] | read[n + k * n + k] for k in range(n)),
-        low=np.where(limited[0], lows, visited[0] - _MARGIN * width),
-        high=np.where(limited[1], highs, visited[1] + _MARGIN * width), limited=limited,
-        noisy=tuple(fields[1].present[k * n + k] for k in range(n)), range=visited,
-        start_low=start_low, start_high=start_high, horizon=horizon,
-        flow=flow, spread=spread,
-    )  # fmt: skip
+    lows, highs = (np.array([room[side] for room in rooms]) for side in (0, 1))  # (stages, rows, n)
+    limited = np.stack([np.isfinite(lows[:, 0]), np.isfinite(highs[:, 0])], axis=1)
+    visited = _visited(problem, start_low, start_high, ends, lows[:, 0], highs[:, 0], flow, around)
+    width = visited[:, 1] - visited[:, 0]
+    free = [
+        _beside((visited[:, 0] - _MARGIN * width).min(axis=0), lows, width.max(axis=0)),
+        _beside((visited[:, 1] + _MARGIN * width).max(axis=0), highs, width.max(axis=0)),
+    ]
+    nowhere = np.full((2, n), np.inf)
+    breaks = clock_breaks([problem.closed_loop, square], horizon) if timed else np.zeros(0)
+    near = 4 * HALF * horizon
+    return [
+        Setting(
+            drift=fields[0], square=fields[1], operators=operators, disturbance=around, nodes=nodes, gaps=gaps,
+            breaks=breaks[(breaks > begin + near) & (breaks < end - near)], timed=timed, pace=pace,
+            varies=tuple(0 in read[k] | read[n + k * n + k] for k in range(n)),
+            low=np.where(limited[k, 0], lows[k], free[0]), high=np.where(limited[k, 1], highs[k], free[1]),
+            limited=limited[k],
+            noisy=tuple(fields[1].present[k * n + k] for k in range(n)), range=visited[k],
+            start_low=start_low, start_high=start_high, begin=begin, horizon=end,
+            staged=len(rooms) > 1 or dues[-1] is not None,
+            due_low=-nowhere if due is None else due[0], due_high=nowhere if due is None else due[1],
+            flow=flow, spread=spread,
+        )
+        for k, (begin, end, due) in enumerate(zip(ends[:-1], ends[1:], dues))
+    ]  # fmt: skip
+
+
+Ends = tuple[Array, Array]
+"""Lower and upper ends of boxes, shapes (2, n): rounded inward (row 0) and outward (row 1)."""
+
+
+def _windows(problem: Problem) -> tuple[list[float], list[Ends], list[Ends | None]]:
+    """Times between which limits do not change, the limits of each stage, and those that are due at its end alone."""
+    horizon, constraints = float(problem.horizon), as_stays(problem.constraints)
+    spans = [(0.0, horizon) if one.during is None else one.during for one in constraints]
+    cuts = sorted({0.0, horizon, *(float(t) for span in spans for t in span if 0 < t < horizon)})
+    if (0.0, 0.0) in spans:
+        raise InfeasibleError("values with a carried error do not serve a limit that is due at time 0 alone.")
+    rooms, dues = [], list[Ends | None]()
+    for begin, end in pairwise(cuts):
+        lasting = [span[0] <= begin and span[1] >= end for span in spans]
+        goes_on = [end < horizon and span[0] <= end < span[1] for span in spans]
+        due = [span[0] <= end <= span[1] and not (a or b) for span, a, b in zip(spans, lasting, goes_on)]
+        rooms.append(_ends(problem, [one for one, there in zip(constraints, lasting) if there]))
+        dues.append(_ends(problem, [one for one, there in zip(constraints, due) if there]) if any(due) else None)
+    return cuts, rooms, dues
+
+
+def _ends(problem: Problem, constraints: list[Inside]) -> Ends:
+    room = limits_among(problem, constraints)
+    return np.array([room.inner_low, room.outer_low]), np.array([room.inner_high, room.outer_high])
+
+
+def _beside(places: Array, limits: Array, width: Array) -> Array:
+    """Ends where no limit stands, shape (2, n): at a limit of another stage where one is near."""
+    result = np.array([places, places])
+    for stage in limits:
+        near = np.abs(stage[0] - places) < 0.5 * _MARGIN * width
+        result = np.where(near, stage, result)
+    return result
 
 
 def _around(start: Region | GaussianStart) -> tuple[Array, Array]:
@@ -225,9 +291,13 @@ def _in_floats(tape: Tape, n: int, usual: Array | None = None) -> Flow:
 
 
 def _visited(
-    problem: Problem, low: Array, high: Array, inner_low: Array, inner_high: Array, flow: Flow, disturbance: Array
-) -> Array:
-    """Quantiles of where simulated paths are while they are safe, shape (2, n); each has an extreme disturbance."""
+    problem: Problem, low: Array, high: Array, ends: Sequence[float], inner_low: Array, inner_high: Array, flow: Flow,
+    disturbance: Array,
+) -> Array:  # fmt: skip
+    """Quantiles of where simulated paths are while they are safe, shape (stages, 2, n).
+
+    Each path has an extreme disturbance; ``ends`` and the limits' inner ends are those of the stages.
+    """
     rng, n = np.random.default_rng(0), problem.system.dimension
     system = problem.system
     assert isinstance(system, ContinuousSystem)
@@ -240,17 +310,24 @@ def _visited(
     for k, start in enumerate(problem.starts):
         if isinstance(start, GaussianStart):
             x[:, which == k] = start.sample(rng, int((which == k).sum())).T
-    low, high = np.clip(low, inner_low, inner_high), np.clip(high, inner_low, inner_high)
-    step, seen = problem.horizon / _STEPS, [x.copy()]
-    alive = np.ones(_PATHS, dtype=bool)
+    low, high = np.clip(low, inner_low[0], inner_high[0]), np.clip(high, inner_low[0], inner_high[0])
+    step, alive = problem.horizon / _STEPS, np.ones(_PATHS, dtype=bool)
+    seen: list[list[Array]] = [[] for _ in ends[1:]]
+    seen[0].append(x.copy())
     for k in range(_STEPS):
+        stage = min(int(np.searchsorted(ends, (k + 1) * step)), len(ends) - 1) - 1
         kicks = noise(x, k * step).reshape(n, columns, -1) * rng.normal(size=(columns, _PATHS))
         moved = x + step * flow(x, k * step, extreme) + math.sqrt(step) * kicks.sum(axis=1)
         x = np.where(alive, moved, x)
-        alive &= np.all((x > inner_low[:, None]) & (x < inner_high[:, None]), axis=0)
-        if k % _EVERY == 0 and alive.any():
-            seen.append(x[:, alive])
-    points = np.concatenate(seen, axis=1)
-    points = points[:, np.isfinite(points).all(axis=0)]
-    least, most = np.quantile(points, [_RARE, 1 - _RARE], axis=1)
-    return np.array([np.minimum(least, low.min(axis=0)), np.maximum(most, high.max(axis=0))])
+        alive &= np.all((x > inner_low[stage][:, None]) & (x < inner_high[stage][:, None]), axis=0)
+        if (k % _EVERY == 0 or not seen[stage]) and alive.any():
+            seen[stage].append(x[:, alive])
+    result = []
+    for k, parts in enumerate(seen):
+        points = np.concatenate(parts or seen[k - 1], axis=1)
+        points = points[:, np.isfinite(points).all(axis=0)]
+        least, most = np.quantile(points, [_RARE, 1 - _RARE], axis=1)
+        if k == 0:
+            least, most = np.minimum(least, low.min(axis=0)), np.maximum(most, high.max(axis=0))
+        result.append((least, most))
+    return np.array(result)

@@ -25,7 +25,15 @@ from certbound.values.kolmogorov.face_exits import ALWAYS, face_of, shortfall
 from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.solve import Discretised, discretised
-from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
+from certbound.values.kolmogorov.splines import (
+    DEGREE,
+    Axis,
+    Sampling,
+    apply_dense,
+    most_of_difference,
+    most_on_cells,
+    sliding_max,
+)
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
@@ -63,24 +71,24 @@ def _graded(length: float, largest: float, first: float, growth: float) -> Array
     return np.array(result + [rest / more] * more)
 
 
-def knots_of(horizon: float, count: int, layer: float, breaks: Array) -> Array:
-    """Times of the knots, from the horizon back to 0: as `time_steps`, with two about every break.
+def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Array) -> Array:
+    """Times of the knots, from the horizon back: as `time_steps`, with two about every break.
 
     Before a break, backward in time, a solution that does not fit the new coefficients at faces has a layer in time.
     """
-    half, largest = HALF * horizon, horizon / count
-    ends = horizon - np.append(breaks[::-1], 0.0)  # passed, backward
+    half, largest = HALF * horizon, (horizon - begin) / count
+    ends = horizon - np.append(breaks[::-1], begin)  # passed, backward
     passed = [0.0]
     for k, end in enumerate(ends):
         last = end - half if k < len(breaks) else end
         first, growth = (layer / _FIRST, _GROWTH) if k == 0 else (layer * _AFTER, _QUICKER)
-        begin = passed[-1]
-        passed += list(begin + np.cumsum(_graded(last - begin, largest, first, growth)))
+        so_far = passed[-1]
+        passed += list(so_far + np.cumsum(_graded(last - so_far, largest, first, growth)))
         passed[-1] = last
         if k < len(breaks):
             passed.append(end + half)
     times = horizon - np.array(passed)
-    times[-1] = 0.0
+    times[-1] = begin
     return np.asarray(times)
 
 
@@ -109,9 +117,12 @@ def extended(nodes: Array, before: int, behind: int) -> Array:
 
 def mesh_of(
     setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool,
-    span: float,
+    span: float, fresh: Mask,
 ) -> Mesh:
-    """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones."""
+    """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones.
+
+    ``fresh``, shape (2, n), says which ends are none of the stage after this.
+    """
     n = setting.dimension
     low, high = setting.low[row], setting.high[row]
     free = {(one.axis, one.side) for one in grazing}
@@ -132,6 +143,8 @@ def mesh_of(
             dead[face] |= leaves
             at_limit[face] |= leaves & bool(setting.limited[side, i])
             width = np.sqrt(max(noise[i, i][face].max(), 0.0) * span) or np.maximum(out, 0).mean() * span
+            if not fresh[side, i]:
+                continue
             third = abs(lines[i][place] - lines[i][3 if side == 0 else -4])
             layer = layer * ramp(np.abs(points[i] - lines[i][place]) / max(width, third))
     for i in range(n):
@@ -159,6 +172,22 @@ def mesh_of(
     return Mesh(
         nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, at_limit=at_limit, rate=rate
     )  # fmt: skip
+
+
+def _across(marked: Mask, axis: int, dimension: int) -> tuple[slice | Mask, ...]:
+    """An index of what is marked along one axis."""
+    return tuple(marked if k == axis else slice(None) for k in range(dimension))
+
+
+def _common(axes: tuple[Axis, ...], others: tuple[Axis, ...]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """The cells that two grids with nodes in common share, in each of them."""
+    own: list[slice] = []
+    places: list[slice] = []
+    for axis, other in zip(axes, others):
+        low, high = max(axis.nodes[0], other.nodes[0]), min(axis.nodes[-1], other.nodes[-1])
+        for line, parts in ((axis.nodes, own), (other.nodes, places)):
+            parts.append(slice(int(np.searchsorted(line, low)), int(np.searchsorted(line, high))))
+    return tuple(own), tuple(places)
 
 
 def _extremes(setting: Setting, points: Array, flow: Array, spread: Array) -> tuple[Array, Array, Array]:
@@ -200,18 +229,30 @@ class Side:
         Steps over the horizon.
     above : bool
         From above or from below.
+    later : Side, optional
+        Of the stage after this one.
+    plan : (nodes, grazing), optional
+        Of `plan_axes`, where there are several stages.
     """
 
-    def __init__(self, setting: Setting, cell: Array, steps: int, above: bool, parts: int | None = None) -> None:
-        self.setting, self.above = setting, above
-        row = 0 if above else 1
-        self.layer = END * float(np.mean(cell)) * setting.horizon
-        nodes, grazing = plan_axes(setting, cell, row)
+    def __init__(
+        self, setting: Setting, cell: Array, steps: int, above: bool, parts: int | None = None,
+        later: Side | None = None, plan: tuple[list[Array], list[Grazing]] | None = None,
+    ) -> None:  # fmt: skip
+        self.setting, self.above, self.later = setting, above, later
+        row = self.row = 0 if above else 1
+        span = setting.horizon - setting.begin
+        self.layer = END * float(np.mean(cell)) * span
+        nodes, grazing = plan or plan_axes([setting], cell, row)[0]
+        fresh = np.ones((2, len(nodes)), dtype=bool)
+        if later is not None:
+            after = later.setting
+            fresh = np.array([after.low[row] != setting.low[row], after.high[row] != setting.high[row]])
         self.axes = tuple(Axis(line, Sampling(parts or (4 if len(nodes) < 3 else 2))) for line in nodes)
-        self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer)
-        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer)
+        self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh)
+        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh)
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
-        self.steps = time_steps(setting.horizon * longer, steps, self.layer)
+        self.steps = time_steps(span * longer, steps, self.layer)
         self._follow_changes(int(np.ceil(setting.pace * steps)))
         products = ((one.drift.on(self.axes, ALWAYS), one.square.on(self.axes, ALWAYS)) for one in setting.operators)
         self.generator = Generator.of(self.axes, *products)
@@ -232,24 +273,25 @@ class Side:
 
     def _follow_changes(self, steps: int) -> None:
         """Knots, and what is known of the factors between them, where the generator changes."""
-        setting, horizon = self.setting, self.setting.horizon
+        setting, begin, horizon = self.setting, self.setting.begin, self.setting.horizon
         self.brief = np.zeros(len(self.steps), dtype=bool)  # slabs about breaks: too short to be carried
         self.clock: Array | None = None
         self.times = horizon - np.append(0.0, np.cumsum(self.steps))
-        if setting.timed:
-            self.times = knots_of(horizon, steps, self.layer, setting.breaks)
+        if setting.timed or setting.staged:  # a stage is as long as it is
+            self.times = knots_of(begin, horizon, steps, self.layer, setting.breaks)
             self.steps = -np.diff(self.times)
             self.brief = self.steps < 4 * HALF * horizon
             self.clock = 2 * CLOCK * horizon / self.steps
         self.factors = [
-            None if one.factor is None else factor_of(one.factor, self.times, horizon, setting.nodes, setting.gaps)
+            None if one.factor is None
+            else factor_of(one.factor, self.times, (begin, horizon), setting.nodes, setting.gaps)
             for one in setting.operators
         ]
         if setting.changing:  # that no factor hides where the model is undefined
             ends = [axis.nodes for axis in self.axes]
             lines = [np.meshgrid(*rows, indexing="ij", sparse=True) for rows in zip(*((e[:-1], e[1:]) for e in ends))]
             cells = [Interval(low, high) for low, high in zip(*lines)]
-            whole = Interval(0.0, horizon)
+            whole = Interval(begin, horizon)
             enclose(setting.drift.tape, [whole, *cells, *(Interval(a, b) for a, b in setting.disturbance.T)])
             enclose(setting.square.tape, [whole, *cells])
 
@@ -257,7 +299,8 @@ class Side:
         """Times that hold the slabs."""
         horizon = self.setting.horizon
         off = CLOCK * horizon
-        return Interval(np.maximum(self.times[1:] - off, 0), np.minimum(self.times[:-1] + off, horizon))
+        low, high = self.times[1:] - off, self.times[:-1] + off
+        return Interval(np.maximum(low, self.setting.begin), np.minimum(high, horizon))
 
     def _now(self, mesh: Mesh, k: int, a: Array | None = None) -> None:
         """Set an equation to knot ``k``; with the survival ``a``, choose the worst disturbances there from it."""
@@ -289,8 +332,19 @@ class Side:
         return np.asarray(np.argmax(loss, axis=0), dtype=np.intp)
 
     @property
+    def stages(self) -> list[Side]:
+        """This side and those of the stages after it."""
+        return [self, *([] if self.later is None else self.later.stages)]
+
+    @property
     def work(self) -> int:
-        """Cells of space and time, each as often as it costs one of a model that does not change."""
+        """Cells of space and time of this and later stages, each as often as it costs one of a model that does not
+        change."""
+        return self.own_work + (0 if self.later is None else self.later.work)
+
+    @property
+    def own_work(self) -> int:
+        """The same of this stage alone."""
         times = _OFTEN[0] + _OFTEN[1] * len(self.setting.nodes) if self.setting.changing else 1.0
         return int(times * np.prod([axis.cells for axis in self.axes]) * len(self.steps))
 
@@ -308,8 +362,71 @@ class Side:
         return [shortfall(self.axes, face, values, rates, self.steps) for face in self.faces]
 
     def shortfall_at_end(self) -> Array:
-        """What v(T) lacks of 0 on every cell."""
-        return np.asarray(np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0))
+        """On every cell, what v at the stage's end lacks of 0, of what a limit that is due asks, or of the next v."""
+        lacks = most_on_cells(self.axes, -self.values[0][None])[0]
+        if self.later is not None:
+            own, places = _common(self.axes, self.later.axes)
+            open_ = lacks + (1.0 if self.above else 0.0)  # beyond ends of the next stage that are no limits
+            difference = most_of_difference(
+                self.axes, self.later.axes, self.values[0], self.later.values[-1], own, places
+            )  # fmt: skip
+            beyond = self._cells_beyond(self.later.setting, limits=True)
+            lost = lacks + self._goal(True)
+            lacks = open_
+            lacks[own] = difference
+            lacks[beyond] = lost[beyond]
+        due = self._cells_beyond(self.setting, limits=False)
+        if due.any():
+            lacks[due] = (most_on_cells(self.axes, -self.values[0][None])[0] + self._goal(True))[due]
+        return np.asarray(np.maximum(lacks, 0.0))
+
+    def _cells_beyond(self, setting: Setting, limits: bool) -> Mask:
+        """Cells beyond a limit of a stage, or beyond one that is due at its end; both stand on nodes."""
+        result = np.zeros(tuple(axis.cells for axis in self.axes), dtype=bool)
+        for k, axis in enumerate(self.axes):
+            low, high = setting.due_low[self.row, k], setting.due_high[self.row, k]
+            if limits:
+                low, high = (
+                    ends[self.row, k] if there else far for ends, there, far in
+                    zip((setting.low, setting.high), setting.limited[:, k], (-np.inf, np.inf))
+                )  # fmt: skip
+            out = (axis.nodes[1:] <= low) | (axis.nodes[:-1] >= high)
+            result |= out.reshape([-1 if j == k else 1 for j in range(len(self.axes))])
+        return result
+
+    def _handed_over(self) -> Array:
+        """Survival at the stage's end at the mesh's nodes: that of the next stage, softly cut where a limit is due."""
+        n, shape = len(self.axes), self.mesh.equation.shape
+        lines = [np.clip(line, axis.nodes[0], axis.nodes[-1]) for line, axis in zip(self.mesh.nodes, self.axes)]
+        a = np.ones(shape)
+        if self.later is not None:
+            v, setting = self.later.values[-1], self.later.setting
+            for k, (line, axis) in enumerate(zip(lines, self.later.axes)):
+                v = axis.at_points(np.clip(line, axis.nodes[0], axis.nodes[-1]), 0).along(v, k)
+            a = np.ascontiguousarray(1 - v if self.above else 1 + v)
+            for beyond_limits in (False, True):
+                for k, line in enumerate(lines):
+                    for side, end in enumerate((setting.low[self.row, k], setting.high[self.row, k])):
+                        if setting.limited[side, k] == beyond_limits:
+                            out = (2 * side - 1) * (line - end) > 0
+                            given = 0.0 if beyond_limits or self.above else 1.0
+                            a[_across(out, k, n)] = given
+        for k, line in enumerate(lines):
+            for side, rows in enumerate((self.setting.due_low, self.setting.due_high)):
+                end = rows[self.row, k]
+                if np.isfinite(end):
+                    width = self._soft(k, float(end))
+                    within = (1 - 2 * side) * (line - end) / width
+                    a = a * ramp(within if self.above else 1 + within).reshape([-1 if j == k else 1 for j in range(n)])
+        return a
+
+    def _soft(self, k: int, end: float) -> float:
+        """How far a limit that is due reaches: what noise smooths within the layer, and three cells."""
+        axis = self.axes[k]
+        place = int(np.clip(np.searchsorted(axis.nodes, end), 3, axis.cells - 3))
+        cells = float(axis.nodes[place + 3] - axis.nodes[place - 3]) / 2
+        spread = self.setting.spread(self.mesh.inside, self.setting.horizon)[k * len(self.axes) + k]
+        return max(cells, float(np.sqrt(max(np.median(spread), 0.0) * self.layer)))
 
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
@@ -319,9 +436,12 @@ class Side:
         def fall(tau: float) -> Array | float:
             if above or tau >= span:
                 return 0.0
-            return np.asarray(-30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit)
+            return np.asarray(-30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit * first)
 
-        a = self.mesh.layer.copy() if above else np.ones(equation.shape)
+        self.values, self.rates, self.policy = [], [], []
+        a = self._handed_over()
+        a = a * self.mesh.layer if above else a
+        first = a.copy()
         tau = 0.0
         self._now(self.mesh, 0, a)
         self._keep(a, equation.speed(a, 0.0, fall(tau)))
@@ -339,7 +459,7 @@ class Side:
 
     def residuals(self) -> list[Array]:
         """A bound of v_t + L v on every cell, slab by slab from the end backward."""
-        many = max(1, _BATCH * len(self.steps) // self.work)
+        many = max(1, _BATCH * len(self.steps) // self.own_work)
         with ThreadPoolExecutor(2) as pool:
             parts = pool.map(lambda begin: self._bounded(begin, begin + many), range(0, len(self.steps), many))
             return [bound for part in parts for bound in part]

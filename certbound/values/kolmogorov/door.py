@@ -13,7 +13,8 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
-from certbound.values.kolmogorov.box_setting import Setting, setting_of
+from certbound.values.kolmogorov.axes import plan_axes
+from certbound.values.kolmogorov.box_setting import Setting, stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
 from certbound.values.kolmogorov.start_law import StartMean
@@ -28,6 +29,7 @@ _GROWTH = 6.0  # the largest factor of work from one grid to the next
 _LEAST = 1.5  # the smallest one that is worth it
 _SHARE, _ORDER = 0.8, 2.0  # of what the target leaves, that an error may take; how fast errors fall with cells
 _FAR = 2.0  # ratio of the coarsest solution to the target, beyond which it says which bound decides
+_FEWEST = 8  # steps of a stage
 _STARTS = 9  # points along each side of a start set
 RATE = {2: 1.5e5, 3: 1.0e5}
 """Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
@@ -66,7 +68,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     Parameters
     ----------
     problem : Problem
-        Continuous time, two or three states, limits along the coordinates; any noise.
+        Continuous time, two or three states, limits along the coordinates, each in a window of its own; any noise.
     seconds : float
         How long to refine, in units of work (`RATE`): the bounds do not depend on the machine or its load. Nothing is
         proved where the coarsest grid takes more.
@@ -86,7 +88,8 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     EnclosureError
         The model is undefined somewhere in the safe set.
     """
-    setting = setting_of(problem)
+    stages = stages_of(problem)
+    setting = stages[0]
     if setting.dimension not in _COARSEST:
         raise InfeasibleError("values with a carried error serve two and three states here.")
     starts, cell = starts_in(problem), _COARSEST[setting.dimension]
@@ -96,12 +99,13 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     while True:
         before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
-            side = Side(setting, np.full(setting.dimension, cell), count, above)
+            side = side_of(stages, cell, count, above)
             cells = cells_of(side.axes)
             if not work and len(sides) * _USUAL * side.work > budget:
                 yield Bounds(lower=0.0, upper=1.0, cells=cells, steps=count, runs=0, estimate=math.nan, work=0.0)
                 return
-            side.propose()
+            for stage in side.stages[::-1]:
+                stage.propose()
             estimate = abs(largest_at_start(side, starts)[0])
             if above and len(sides) > 1 and estimate > _FAR * delta > 0:
                 continue
@@ -127,26 +131,65 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
         cell /= growth ** (1 / (setting.dimension + 1))
 
 
+def side_of(stages: Sequence[Setting], cell: float, count: int, above: bool) -> Side:
+    """One bound on one grid, of the first of the stages; ``count`` steps go over all of them."""
+    cells = np.full(stages[0].dimension, cell)
+    plans = plan_axes(stages, cells, 0 if above else 1)
+    later: Side | None = None
+    for one, plan in zip(reversed(stages), reversed(plans)):
+        share = (one.horizon - one.begin) / stages[-1].horizon
+        later = Side(one, cells, max(math.ceil(share * count), _FEWEST), above, later=later, plan=plan)
+    assert later is not None
+    return later
+
+
 def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float, float, int]:
     """The bound of one side: passes of the carried error until what is left of the residual is paid.
 
     Passes end early once v at the start, which only grows, is beyond ``target``. The bound, v there, and their number.
     """
-    best, passes = math.inf, 0
+    best, passes, rest = math.inf, 0, 0.0
+    if side.later is not None:
+        rest = _settled(side.later, _PAID * abs(largest_at_start(side, starts)[0]))
+        side.propose()
     while True:
         passes += 1
         poll("solving for the error that is left")
         if not side.finite:
             return best, math.inf, passes
         residuals = side.residuals()
-        left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
-        missing = max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
+        left, missing = _unpaid(side, residuals)
+        left += rest
         value = largest_at_start(side, starts)[1]
         best = min(best, value + (left + missing) * (1 + 1e-9) + 1e-15)
         paid, hopeless = left + missing <= _PAID * abs(value), value >= min(1.0 if side.above else 0.0, target)
         if paid or hopeless or passes == _PASSES:
             return best, value, passes
         side.correct(residuals)
+
+
+def _unpaid(side: Side, residuals: Sequence[Array]) -> tuple[float, float]:
+    """What is left of the residuals, and the most that v lacks at the end and at faces."""
+    left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
+    return left, max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
+
+
+def _settled(side: Side, enough: float) -> float:
+    """Passes for a later stage until at most ``enough`` is left; what is left of it and of those after it."""
+    rest = 0.0
+    if side.later is not None:
+        rest = _settled(side.later, enough)
+        side.propose()
+    for number in range(_PASSES):
+        poll("solving for the error that is left of a later stage")
+        if not side.finite:
+            return math.inf
+        residuals = side.residuals()
+        unpaid = sum(_unpaid(side, residuals))
+        if unpaid <= enough or number == _PASSES - 1:
+            break
+        side.correct(residuals)
+    return (rest + unpaid) * (1 + 1e-9)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -114,7 +114,7 @@ def _affine(tape: Tape, slot: int) -> bool:
     return is_zero(_derivative(tape, slot, 2), 0)
 
 
-def factor_of(tape: Tape, times: Array, horizon: float, nodes: Array, gaps: Array) -> Factor:
+def factor_of(tape: Tape, times: Array, within: tuple[float, float], nodes: Array, gaps: Array) -> Factor:
     """A coefficient on slabs.
 
     Parameters
@@ -123,13 +123,15 @@ def factor_of(tape: Tape, times: Array, horizon: float, nodes: Array, gaps: Arra
         c over ``("t", *disturbances)``, one output.
     times : ndarray, shape (K + 1,)
         Knots from the last one backward, each right up to `CLOCK` of the horizon.
+    within : (float, float)
+        Exact times of the first and the last knot.
     nodes, gaps : ndarray
         Of `disturbance_nodes`.
     """
-    early, late, off = times[1:], times[:-1], CLOCK * horizon
+    early, late, off = times[1:], times[:-1], CLOCK * within[1]
     timed = 0 in set().union(*reads(tape))
     degree = DEGREE if timed else 0
-    slab = _clipped(early - off, late + off, horizon)
+    slab = _clipped(early - off, late + off, within)
     rows, errors = [], []
     for node in nodes:
         fixed = [Interval.point(np.full(len(early), d)) for d in node]
@@ -139,7 +141,7 @@ def factor_of(tape: Tape, times: Array, horizon: float, nodes: Array, gaps: Arra
             errors.append(np.asarray(value.rad))
             continue
         points = [early + share * (late - early) for share in _TAIL.nodes]
-        at = [enclose(tape, [_clipped(t - off, t + off, horizon), *fixed])[0][0] for t in points]
+        at = [enclose(tape, [_clipped(t - off, t + off, within), *fixed])[0][0] for t in points]
         middle = np.stack([np.broadcast_to(value.mid, early.shape) for value in at], axis=1)
         radius = np.max([np.broadcast_to(value.rad, early.shape) for value in at], axis=0)
         (range_,), edge = enclose(tape, [slab, *fixed])
@@ -162,8 +164,8 @@ def factor_of(tape: Tape, times: Array, horizon: float, nodes: Array, gaps: Arra
     return Factor(bernstein=bernstein, error=error, between=between * (1 + 1e-12))
 
 
-def _clipped(low: Array, high: Array, horizon: float) -> Interval:
-    return Interval(np.clip(low, 0.0, horizon), np.clip(high, 0.0, horizon))
+def _clipped(low: Array, high: Array, within: tuple[float, float]) -> Interval:
+    return Interval(np.clip(low, *within), np.clip(high, *within))
 
 
 def _magnitude(tape: Tape, inputs: list[Interval]) -> Array:

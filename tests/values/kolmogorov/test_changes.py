@@ -85,7 +85,7 @@ def test_a_factor_is_off_its_polynomials_by_at_most_its_errors(name: str) -> Non
     text, most = FACTORS[name]
     coefficient = of_time(text)
     times = np.linspace(2, 0, 12)
-    factor = factor_of(coefficient, times, 2.0, *disturbance_nodes([coefficient], np.zeros(0), np.zeros(0)))
+    factor = factor_of(coefficient, times, (0.0, 2.0), *disturbance_nodes([coefficient], np.zeros(0), np.zeros(0)))
     s = np.linspace(0, 1, 101)[:, None]
     basis = np.concatenate([(1 - s) ** 2, 2 * s * (1 - s), s**2], axis=1)
     for k in range(11):
@@ -99,7 +99,7 @@ def test_a_factor_is_off_its_polynomials_by_at_most_its_errors(name: str) -> Non
 def test_a_factor_between_the_nodes_of_a_disturbance_that_bends_it_is_paid_for() -> None:
     coefficient = of_time(lambda t, x, d: [x[0] * np.sin(2 * d[0]) * t], cb.Box([-1], [1]))
     nodes, gaps = disturbance_nodes([coefficient], np.array([-1.0]), np.array([1.0]))
-    factor = factor_of(coefficient, np.linspace(2, 0, 5), 2.0, nodes, gaps)
+    factor = factor_of(coefficient, np.linspace(2, 0, 5), (0.0, 2.0), nodes, gaps)
     assert len(nodes) == 5
     d = np.linspace(-1, 1, 201)
     chords = np.interp(d, nodes[:, 0], compile_numpy(coefficient)(2.0, nodes[:, 0])[:, 0])
@@ -117,7 +117,7 @@ def test_too_many_disturbances_are_refused_in_words() -> None:
 def test_a_factor_without_a_finite_range_is_refused() -> None:
     coefficient = of_time(lambda t, x: [x[0] / (t - 1)])
     with pytest.raises(EnclosureError):
-        factor_of(coefficient, np.linspace(2, 0, 6), 2.0, np.zeros((1, 0)), np.zeros(0))
+        factor_of(coefficient, np.linspace(2, 0, 6), (0.0, 2.0), np.zeros((1, 0)), np.zeros(0))
 
 
 def test_the_clock_s_jumps_and_bends_are_found_and_each_stands_in_a_slab_of_its_own() -> None:
@@ -127,7 +127,7 @@ def test_the_clock_s_jumps_and_bends_are_found_and_each_stands_in_a_slab_of_its_
     ).dynamics  # fmt: skip
     breaks = clock_breaks([tape], 2.0)
     assert np.allclose(breaks, [0.3, 0.9, np.pi / 2, 1.8], atol=1e-12)
-    times = knots_of(2.0, 20, 0.1, breaks)
+    times = knots_of(0.0, 2.0, 20, 0.1, breaks)
     assert times[0] == 2.0
     assert times[-1] == 0.0
     assert np.all(np.diff(times) < 0)
