@@ -11,7 +11,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
-from certbound.problem.model import Graph, Tape, compile_numpy, sources
+from certbound.problem.model import JUMPS, Graph, Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart, Inside, Region
 from certbound.problem.systems import ContinuousSystem
@@ -119,6 +119,12 @@ class Setting:
     def changing(self) -> bool:
         """Whether the generator is more than one operator that lasts."""
         return len(self.operators) > 1 or self.operators[0].factor is not None
+
+    @property
+    def torn(self) -> bool:
+        """Whether the drift jumps somewhere and disturbances act: nothing is said of the worst of these then."""
+        jumps = any(node.op in JUMPS or node.op == "atan2" for one in self.operators for node in one.drift.tape.nodes)
+        return len(self.nodes) > 1 and jumps
 
     def moments(self, axis: int | None = None) -> Array:
         """Times at which f_i or a_ii (or any of them) is looked at."""

@@ -95,7 +95,8 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     starts, cell = starts_in(problem), _COARSEST[setting.dimension]
     budget = seconds * RATE[setting.dimension]
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
-    sides: tuple[bool, ...] = (True,) if problem.unknown else (True, False)  # constants are no worst disturbance
+    only = bool(problem.unknown) or setting.torn  # constants are no worst disturbance
+    sides: tuple[bool, ...] = (True,) if only else (True, False)
     while True:
         before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
@@ -127,7 +128,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
             needed = (carried / max(room, 1e-300)) ** ((setting.dimension + 1) / _ORDER)
             growth = max(min(growth, needed), _LEAST)
             growth = min(growth * len(sides), _GROWTH)
-            sides = (estimate < delta or bool(problem.unknown),)
+            sides = (estimate < delta or only,)
         cell /= growth ** (1 / (setting.dimension + 1))
 
 

@@ -294,3 +294,19 @@ def test_a_root_that_no_factor_shows_is_refused_where_it_is_undefined() -> None:
     assert isinstance(setting, Setting)
     with pytest.raises(EnclosureError, match="undefined"):
         Side(setting, np.full(2, 0.2), 8, True)
+
+
+def test_no_lower_bound_is_said_of_unknown_constants_or_of_disturbances_where_the_drift_jumps() -> None:
+    stay = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    torn = cb.ContinuousSystem(
+        lambda x, d: [np.where(x[0] < 0.1, 0.4, -0.4) + d[0], -x[1]], states=2, diffusion=0.5 * np.eye(2),
+        disturbance=cb.Box([-0.3], [0.3]),
+    )  # fmt: skip
+    assert setting_of(cb.Problem(torn, initial=[0, 0], safe=stay, horizon=2.0)).torn
+    smooth = cb.ContinuousSystem(
+        lambda x, d: [d[0] - x[0], -x[1]], states=2, diffusion=0.5 * np.eye(2), disturbance=cb.Box([-0.3], [0.3])
+    )
+    worst = cb.Problem(smooth, initial=[0.6, 0], safe=stay, horizon=1.0)
+    assert not setting_of(worst).torn
+    for asked in (worst.replace(unknown=["d"]), worst.replace(system=torn, horizon=0.5)):
+        assert all(found.lower == 0 for found in bound_failing(asked, seconds=1.5))
