@@ -166,6 +166,7 @@ ENGINES: dict[str, Engine] = {
             reserve=True,
             refines=True,
             dear=True,
+            reaches=True,
         ),
         Engine(
             name="barrier",

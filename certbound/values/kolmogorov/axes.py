@@ -47,7 +47,8 @@ def plan_axes(stages: Sequence[Setting], cell: Array, row: int) -> list[tuple[li
     for i in range(stages[0].dimension):
         ends = [float(end) for one in stages for rows in (one.low, one.high, one.due_low, one.due_high)
                 for end in rows[row, i : i + 1] if np.isfinite(end)]  # fmt: skip
-        cuts = np.unique(ends)
+        ends += [float(end) for one in stages if one.target is not None for end in one.target[:, row, i]]
+        cuts = np.unique([end for end in ends if np.isfinite(end)])
         cuts = cuts[(cuts >= min(float(one.low[row, i]) for one in stages))
                     & (cuts <= max(float(one.high[row, i]) for one in stages))]  # fmt: skip
         sizes = [size for own, _ in planned for size in own[i]]

@@ -11,6 +11,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import InfeasibleError
+from certbound.problem.goals import until
 from certbound.problem.model import JUMPS, Graph, Tape, compile_numpy, sources
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart, Inside, Region
@@ -83,6 +84,8 @@ class Setting:
         Whether there are more stages, or limits that are due at the end alone.
     due_low, due_high : ndarray, shape (2, n)
         Limits that are due at the end of the stage alone, rounded as ``low`` and ``high``; infinite for none.
+    target : ndarray, shape (2, 2, n), or None
+        Lower and upper ends of the target, rounded as ``low`` and ``high``: a path that is in it has not failed.
     """
 
     drift: Fields
@@ -107,6 +110,7 @@ class Setting:
     staged: bool
     due_low: Array
     due_high: Array
+    target: Array | None
     flow: Flow
     spread: Flow
 
@@ -144,21 +148,26 @@ def stages_of(problem: Problem) -> list[Setting]:
     Raises
     ------
     InfeasibleError
-        What is not served yet: moving or curved sets, targets, models in which time or disturbances are not apart from
-        the states; the message says which.
+        What is not served yet: moving or curved sets, starts that meet the target, models in which time or disturbances
+        are not apart from the states; the message says which.
     """
     system = problem.system
     if not isinstance(system, ContinuousSystem):
         raise InfeasibleError("values with a carried error need continuous time here; the problem is discrete.")
     served = {
-        "a target": problem.reach is None, "a plan that is an array": problem.input_sequence is None,
+        "a plan that is an array": problem.input_sequence is None,
         "an infinite horizon": not problem.endless, "paths that end as they leave the domain": not problem.ending,
     }  # fmt: skip
     missing = [name for name, there in served.items() if not there]
     if missing:
         raise InfeasibleError(f"values with a carried error do not serve {missing[0]} yet.")
-    n, horizon = system.dimension, float(problem.horizon)
-    ends, rooms, dues = _windows(problem)
+    n = system.dimension
+    problem, target, opens = _with_target(problem)
+    horizon = float(problem.horizon)
+    ends, rooms, dues = _windows(problem, opens)
+    if target is not None:
+        due = dues[-1]
+        dues[-1] = target if due is None else (np.maximum(due[0], target[0]), np.minimum(due[1], target[1]))
     square = squared_diffusion(system.diffusion, system.states)
     fields = (Fields(problem.closed_loop, n), Fields(square, n))
     box = system.disturbance
@@ -174,7 +183,8 @@ def stages_of(problem: Problem) -> list[Setting]:
     flow, spread = _in_floats(problem.closed_loop, n, middle), _in_floats(square, n)
     lows, highs = (np.array([room[side] for room in rooms]) for side in (0, 1))  # (stages, rows, n)
     limited = np.stack([np.isfinite(lows[:, 0]), np.isfinite(highs[:, 0])], axis=1)
-    visited = _visited(problem, start_low, start_high, ends, lows[:, 0], highs[:, 0], flow, around)
+    hit = None if opens else target
+    visited = _visited(problem, start_low, start_high, ends, lows[:, 0], highs[:, 0], flow, around, hit)
     width = visited[:, 1] - visited[:, 0]
     free = [
         _beside((visited[:, 0] - _MARGIN * width).min(axis=0), lows, width.max(axis=0)),
@@ -194,7 +204,7 @@ def stages_of(problem: Problem) -> list[Setting]:
             start_low=start_low, start_high=start_high, begin=begin, horizon=end,
             staged=len(rooms) > 1 or dues[-1] is not None,
             due_low=-nowhere if due is None else due[0], due_high=nowhere if due is None else due[1],
-            flow=flow, spread=spread,
+            target=None if target is None or begin < opens else np.array(target), flow=flow, spread=spread,
         )
         for k, (begin, end, due) in enumerate(zip(ends[:-1], ends[1:], dues))
     ]  # fmt: skip
@@ -204,11 +214,29 @@ Ends = tuple[Array, Array]
 """Lower and upper ends of boxes, shapes (2, n): rounded inward (row 0) and outward (row 1)."""
 
 
-def _windows(problem: Problem) -> tuple[list[float], list[Ends], list[Ends | None]]:
-    """Times between which limits do not change, the limits of each stage, and those that are due at its end alone."""
+def _with_target(problem: Problem) -> tuple[Problem, Ends | None, float]:
+    """The problem up to the time when its target no longer counts, the target's ends, and from when on it counts."""
+    target, horizon = problem.reach, float(problem.horizon)
+    if target is None:
+        return problem, None, 0.0
+    first, last = target.during or (0.0, horizon)
+    plain = until(problem, last)
+    ends = _ends(plain, [Inside(target.region, label=target.label)])
+    for start in plain.starts:
+        low, high = _around(start)
+        if first == 0 and (isinstance(start, GaussianStart) or np.all((high >= ends[0][1]) & (low <= ends[1][1]))):
+            raise InfeasibleError("values with a carried error need a set of starts apart from the target.")
+    return plain, ends, first
+
+
+def _windows(problem: Problem, opens: float) -> tuple[list[float], list[Ends], list[Ends | None]]:
+    """Times between which limits do not change, the limits of each stage, and those that are due at its end alone.
+
+    ``opens`` is one more such time.
+    """
     horizon, constraints = float(problem.horizon), as_stays(problem.constraints)
     spans = [(0.0, horizon) if one.during is None else one.during for one in constraints]
-    cuts = sorted({0.0, horizon, *(float(t) for span in spans for t in span if 0 < t < horizon)})
+    cuts = sorted({0.0, horizon, opens, *(float(t) for span in spans for t in span if 0 < t < horizon)})
     if (0.0, 0.0) in spans:
         raise InfeasibleError("values with a carried error do not serve a limit that is due at time 0 alone.")
     rooms, dues = [], list[Ends | None]()
@@ -298,7 +326,7 @@ def _in_floats(tape: Tape, n: int, usual: Array | None = None) -> Flow:
 
 def _visited(
     problem: Problem, low: Array, high: Array, ends: Sequence[float], inner_low: Array, inner_high: Array, flow: Flow,
-    disturbance: Array,
+    disturbance: Array, target: Ends | None,
 ) -> Array:  # fmt: skip
     """Quantiles of where simulated paths are while they are safe, shape (stages, 2, n).
 
@@ -326,6 +354,8 @@ def _visited(
         moved = x + step * flow(x, k * step, extreme) + math.sqrt(step) * kicks.sum(axis=1)
         x = np.where(alive, moved, x)
         alive &= np.all((x > inner_low[stage][:, None]) & (x < inner_high[stage][:, None]), axis=0)
+        if target is not None:
+            alive &= ~np.all((x > target[0][0][:, None]) & (x < target[1][0][:, None]), axis=0)
         if (k % _EVERY == 0 or not seen[stage]) and alive.any():
             seen[stage].append(x[:, alive])
     result = []

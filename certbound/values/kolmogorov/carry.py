@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -21,7 +21,7 @@ from certbound.values.enclosing import enclose
 from certbound.values.kolmogorov.axes import Grazing, plan_axes
 from certbound.values.kolmogorov.box_setting import Setting
 from certbound.values.kolmogorov.changing import ChangingEquation
-from certbound.values.kolmogorov.face_exits import ALWAYS, face_of, shortfall
+from certbound.values.kolmogorov.face_exits import ALWAYS, Face, face_of, shortfall
 from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.solve import Discretised, discretised
@@ -106,6 +106,7 @@ class Mesh:
     layer: Array
     at_limit: Mask
     rate: Array
+    arrival: Array | float
 
 
 def extended(nodes: Array, before: int, behind: int) -> Array:
@@ -117,11 +118,12 @@ def extended(nodes: Array, before: int, behind: int) -> Array:
 
 def mesh_of(
     setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool,
-    span: float, fresh: Mask,
+    span: float, fresh: Mask, early: bool = False,
 ) -> Mesh:
     """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones.
 
-    ``fresh``, shape (2, n), says which ends are none of the stage after this.
+    ``fresh``, shape (2, n), says which ends are none of the stage after this; ``early`` whether paths arrive in some
+    cells before the target, or in its first cells.
     """
     n = setting.dimension
     low, high = setting.low[row], setting.high[row]
@@ -164,14 +166,43 @@ def mesh_of(
         if kill:
             width = (0.3 * _SOFT**3 + 2) * one.scale
             rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(slowest[one.axis] / (_SOFT * one.speed))
+    arrival: Array | float = 0.0
     layer[dead] = 0
+    if setting.target is not None:
+        depth, soonest = _depth(setting.target[:, row], lines, points), np.zeros(shape)
+        for i in range(n):
+            width = np.maximum(3 * np.gradient(lines[i]), 1e-300).reshape([-1 if k == i else 1 for k in range(n)])
+            soonest = soonest + size[i] / width + noise[i, i] / width**2
+        arrival = _KILL * soonest * ramp(1 + depth if early else depth)
+        rate += arrival
+        layer[depth > 0] = 1
+        at_limit &= depth <= 0
     equation: Discretised | ChangingEquation = (
         ChangingEquation(lines, dead, rate, setting.noisy) if setting.changing
         else discretised(lines, flow, spread, dead, rate)
     )  # fmt: skip
     return Mesh(
-        nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, at_limit=at_limit, rate=rate
+        nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, at_limit=at_limit, rate=rate,
+        arrival=arrival,
     )  # fmt: skip
+
+
+def _depth(target: Array, lines: tuple[Array, ...], points: Array) -> Array:
+    """How deep nodes lie in the target, in units of three cells at its faces, negative before it.
+
+    Where it reaches beyond the grid it has no face.
+    """
+    depth = np.full(points.shape[1:], np.inf)
+    for i, line in enumerate(lines):
+        for side in (0, 1):
+            end = target[side, i]
+            if line[0] < end < line[-1]:
+                place = int(np.clip(np.searchsorted(line, end), 3, len(line) - 4))
+                cells = (line[place + 3] - line[place - 3]) / 2
+                depth = np.minimum(depth, (1 - 2 * side) * (points[i] - end) / cells)
+            elif (end >= line[-1]) != bool(side):
+                depth = np.full_like(depth, -np.inf)
+    return depth
 
 
 def _across(marked: Mask, axis: int, dimension: int) -> tuple[slice | Mask, ...]:
@@ -207,6 +238,10 @@ def _bump(y: Array) -> Array:
 
 def _nothing(part: float) -> float:
     return 0.0
+
+
+def _same(value: Array | float, part: float) -> Array | float:
+    return value
 
 
 def _between(first: Array, last: Array, part: float) -> Array:
@@ -249,7 +284,9 @@ class Side:
             after = later.setting
             fresh = np.array([after.low[row] != setting.low[row], after.high[row] != setting.high[row]])
         self.axes = tuple(Axis(line, Sampling(parts or (4 if len(nodes) < 3 else 2))) for line in nodes)
-        self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh)
+        self.mesh = mesh_of(
+            setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh, not above
+        )
         self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh)
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
         self.steps = time_steps(span * longer, steps, self.layer)
@@ -267,9 +304,40 @@ class Side:
             )
             for i in range(n) for side in (0, 1)
         ]  # fmt: skip
+        self.arrived = self._cells_arrived(setting)
+        if self.arrived.any():
+            self.faces = [self._before_target(face) for face in self.faces] + self._target_faces()
         self.values: list[Array] = []
         self.rates: list[Array] = []
         self.policy: list[Index | None] = []
+
+    def _cells_arrived(self, setting: Setting) -> Mask:
+        """Cells within the target of a stage, whose faces stand on nodes."""
+        shape = tuple(axis.cells for axis in self.axes)
+        if setting.target is None:
+            return np.zeros(shape, dtype=bool)
+        result = np.ones(shape, dtype=bool)
+        for k, axis in enumerate(self.axes):
+            low, high = setting.target[:, self.row, k]
+            own = (axis.nodes[:-1] >= low) & (axis.nodes[1:] <= high)
+            result &= own.reshape([-1 if j == k else 1 for j in range(len(self.axes))])
+        return result
+
+    def _before_target(self, face: Face) -> Face:
+        """A face of the box without its cells within the target."""
+        there = np.take(self.arrived, -1 if face.side else 0, axis=face.axis)
+        return replace(face, leaves=face.leaves & ~there)
+
+    def _target_faces(self) -> list[Face]:
+        """Faces of the target within the box, at which v is to be at least 0."""
+        result = []
+        for k, axis in enumerate(self.axes):
+            along = np.flatnonzero(self.arrived.any(axis=tuple(j for j in range(len(self.axes)) if j != k)))
+            leaves = np.asarray(self.arrived.any(axis=k))
+            for side, place in ((0, int(along[0])), (1, int(along[-1]) + 1)):
+                if 0 < place < axis.cells:
+                    result.append(Face(axis=k, side=side, leaves=leaves, goal=0.0, place=place))
+        return result
 
     def _follow_changes(self, steps: int) -> None:
         """Knots, and what is known of the factors between them, where the generator changes."""
@@ -378,6 +446,10 @@ class Side:
         due = self._cells_beyond(self.setting, limits=False)
         if due.any():
             lacks[due] = (most_on_cells(self.axes, -self.values[0][None])[0] + self._goal(True))[due]
+        if self.later is not None:
+            arrived = self._cells_arrived(self.later.setting)  # there the next v may be anything
+            lacks[arrived] = most_on_cells(self.axes, -self.values[0][None])[0][arrived]
+            lacks[self.arrived] = 0.0
         return np.asarray(np.maximum(lacks, 0.0))
 
     def _cells_beyond(self, setting: Setting, limits: bool) -> Mask:
@@ -444,13 +516,14 @@ class Side:
         first = a.copy()
         tau = 0.0
         self._now(self.mesh, 0, a)
-        self._keep(a, equation.speed(a, 0.0, fall(tau)))
+        arrival = self.mesh.arrival
+        self._keep(a, equation.speed(a, arrival, fall(tau)))
         for k, step in enumerate(self.steps):
             if not self.brief[k]:
-                a = equation.step(a, step, _nothing, partial(_later, fall, tau, step))
+                a = equation.step(a, step, partial(_same, arrival), partial(_later, fall, tau, step))
             tau += step
             self._now(self.mesh, k + 1, a)
-            self._keep(a, equation.speed(a, 0.0, fall(tau)))
+            self._keep(a, equation.speed(a, arrival, fall(tau)))
 
     def _keep(self, a: Array, speed: Array) -> None:
         sign = -1.0 if self.above else 1.0
@@ -470,7 +543,8 @@ class Side:
         factors = [None if one is None else one.on(slice(begin, end)) for one in self.factors]
         clock = None if self.clock is None else self.clock[begin:end]
         bound = residual_bound(self.generator, values, rates, steps, factors, worst=self.above, clock=clock)
-        return list(np.where(self._decided(values, rates, steps), 0.0, np.maximum(bound, 0.0)))
+        done = self._decided(values, rates, steps) | self.arrived
+        return list(np.where(done, 0.0, np.maximum(bound, 0.0)))
 
     def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:
         """Cells and slabs on which v is so large that nothing is asked of it any more."""
@@ -503,10 +577,13 @@ class Side:
         total = [np.zeros(self.carrier.equation.shape) for _ in self.steps]
         for face, missing in zip(self.faces, self.shortfalls()):
             pad = self.carrier.pad[face.axis][face.side]
-            if not pad or not missing.any():
-                continue
             length = self.carrier.equation.shape[face.axis]
             beyond = slice(length - pad, length) if face.side else slice(0, pad)
+            if face.place is not None:
+                first = face.place + self.carrier.pad[face.axis][0]
+                pad, beyond = 1, slice(0, first + 1) if face.side else slice(first, length)
+            if not pad or not missing.any():
+                continue
             place = tuple(beyond if k == face.axis else slice(None) for k in range(len(self.axes)))
             for k, one in enumerate(missing):
                 if one.any():
