@@ -96,7 +96,8 @@ def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Arr
 class Mesh:
     """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis).
 
-    ``inside`` holds the points of the box nearest to the nodes.
+    ``inside`` holds the points of the box nearest to the nodes; ``layer`` is the survival at the end that faces allow,
+    ``falls`` the share of it that limits take within the end layer, ``arrival`` the rate of arriving in the target.
     """
 
     nodes: tuple[Array, ...]
@@ -104,7 +105,7 @@ class Mesh:
     inside: Array
     equation: Discretised | ChangingEquation
     layer: Array
-    at_limit: Mask
+    falls: Array
     rate: Array
     arrival: Array | float
 
@@ -168,21 +169,23 @@ def mesh_of(
             rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(slowest[one.axis] / (_SOFT * one.speed))
     arrival: Array | float = 0.0
     layer[dead] = 0
+    falls = at_limit.astype(float)
     if setting.target is not None:
         depth, soonest = _depth(setting.target[:, row], lines, points), np.zeros(shape)
         for i in range(n):
             width = np.maximum(3 * np.gradient(lines[i]), 1e-300).reshape([-1 if k == i else 1 for k in range(n)])
             soonest = soonest + size[i] / width + noise[i, i] / width**2
-        arrival = _KILL * soonest * ramp(1 + depth if early else depth)
+        there = ramp(1 + depth if early else depth)
+        arrival = _KILL * soonest * there
         rate += arrival
-        layer[depth > 0] = 1
-        at_limit &= depth <= 0
+        layer += (1 - layer) * there
+        falls *= 1 - there
     equation: Discretised | ChangingEquation = (
         ChangingEquation(lines, dead, rate, setting.noisy) if setting.changing
         else discretised(lines, flow, spread, dead, rate)
     )  # fmt: skip
     return Mesh(
-        nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, at_limit=at_limit, rate=rate,
+        nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, falls=falls, rate=rate,
         arrival=arrival,
     )  # fmt: skip
 
@@ -503,7 +506,7 @@ class Side:
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
         equation, span = self.mesh.equation, self.layer
-        above, limit = self.above, self.mesh.at_limit
+        above, limit = self.above, self.mesh.falls
 
         def fall(tau: float) -> Array | float:
             if above or tau >= span:

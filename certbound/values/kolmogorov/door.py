@@ -171,7 +171,8 @@ def refined(side: Side, starts: Starts, target: float = math.inf) -> tuple[float
 
 def _unpaid(side: Side, residuals: Sequence[Array]) -> tuple[float, float]:
     """What is left of the residuals, and the most that v lacks at the end and at faces."""
-    left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
+    lengths = side.steps if side.clock is None else side.steps * (1 + side.clock)
+    left = sum(float(h) * float(r.max()) for h, r in zip(lengths, residuals))
     return left, max(float(side.shortfall_at_end().max()), *(float(q.max()) for q in side.shortfalls()))
 
 
