@@ -130,7 +130,7 @@ MANY_DOORS = {
     "values.continuous": (16, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (39, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (40, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (21, "events in both times, for noise that depends on the state and not; units; jumps"),
     "reach.linear": (19, "certificates state the records of the search: linearisations, shares; bounds from below"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),

@@ -170,6 +170,7 @@ ENGINES: dict[str, Engine] = {
             reserve=True,
             refines=True,
             dear=True,
+            reaches=True,
         ),
         Engine(
             name="barrier",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,10 +59,24 @@ def limits_of(problem: Problem) -> Room:
     InfeasibleError
         Windows, moving sets, curved or oblique sets in several states.
     """
+    constraints = as_stays(problem.constraints)
+    for constraint in constraints:
+        refuse_windows(constraint, problem)
+    return limits_among(problem, constraints)
+
+
+def limits_among(problem: Problem, constraints: Sequence[Inside]) -> Room:
+    """The box of some of the limits, to stay within, whenever they are due; infinite where there is none.
+
+    Raises
+    ------
+    InfeasibleError
+        Moving sets, curved or oblique sets in several states.
+    """
     n = problem.system.dimension
     lows, highs = [[-np.inf] * n, [-np.inf] * n], [[np.inf] * n, [np.inf] * n]
-    for constraint in as_stays(problem.constraints):
-        refuse_windows(constraint, problem)
+    for constraint in constraints:
+        refuse_moving(constraint)
         for axis, side, inner, outer in _faces(constraint, problem):
             for place, value in enumerate((inner, outer)):
                 if side == 0:
@@ -74,10 +89,15 @@ def limits_of(problem: Problem) -> Room:
 
 def refuse_windows(constraint: Inside, problem: Problem) -> None:
     """Refuse, in words, a constraint that moves or does not hold at all times."""
-    if constraint.region.moving:
-        raise InfeasibleError(f"value functions do not serve moving sets yet ('{constraint.label}').")
+    refuse_moving(constraint)
     if constraint.during is not None and constraint.during != (0.0, float(problem.horizon)):
         raise InfeasibleError(f"value functions do not serve constraints over a window yet ('{constraint.label}').")
+
+
+def refuse_moving(constraint: Inside) -> None:
+    """Refuse, in words, a constraint that moves."""
+    if constraint.region.moving:
+        raise InfeasibleError(f"value functions do not serve moving sets yet ('{constraint.label}').")
 
 
 def _faces(constraint: Inside, problem: Problem) -> list[tuple[int, int, float, float]]:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from certbound.problem.model.tracing import call_network, trace
 
 _HOME = {
-    "analysis": "adds_plainly deciding edged is_zero selected sources varying_outputs watched",
+    "analysis": "adds_plainly deciding edged is_zero reads selected sources varying_outputs watched",
     "derivative": "jacobian",
     "evaluation": "compile_numpy compile_scalar",
     "graph": "Graph substitute",
@@ -82,6 +82,7 @@ __all__ = [
     "OPERATIONS",
     "Part",
     "PARTS",
+    "reads",
     "relaxed",
     "rounded_comparison",
     "ROWS",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,14 +38,38 @@ class Grazing:
     scale: float
 
 
-def plan_axes(
-    setting: Setting, cell: Array, row: int, shapes: Sequence[Size] = ()
-) -> tuple[list[Array], list[Grazing]]:  # fmt: skip
-    """Nodes of each axis, and where paths graze.
+Plan = tuple[list[Array], list[Grazing]]
+"""Nodes of each axis, and where paths graze."""
+
+
+def plan_axes(stages: Sequence[Setting], cell: Array, row: int, shapes: Sequence[Size] = ()) -> list[Plan]:
+    """Nodes of each axis, and where paths graze, for each stage; stages have the nodes in common that both hold.
 
     ``cell`` holds a share of the range for each axis; ``row`` says which ends of the box are meant (0: the inner ones).
     With ``shapes``, a width at every place of each axis, cells follow these but where paths graze.
     """
+    planned = [_sizes(one, cell, row, shapes) for one in stages]
+    lines = []
+    for i in range(stages[0].dimension):
+        ends = [float(end) for one in stages for rows in (one.low, one.high, one.due_low, one.due_high)
+                for end in rows[row, i : i + 1] if np.isfinite(end)]  # fmt: skip
+        ends += [float(end) for one in stages if one.target is not None for end in one.target[:, row, i]]
+        cuts = np.unique([end for end in ends if np.isfinite(end)])
+        cuts = cuts[(cuts >= min(float(one.low[row, i]) for one in stages))
+                    & (cuts <= max(float(one.high[row, i]) for one in stages))]  # fmt: skip
+        sizes = [size for own, _ in planned for size in own[i]]
+        parts = [_nodes(low, high, sizes) for low, high in pairwise(cuts)]
+        lines.append(np.unique(np.concatenate(parts)))
+    return [
+        ([line[(line >= one.low[row, i]) & (line <= one.high[row, i])] for i, line in enumerate(lines)], grazing)
+        for one, (_, grazing) in zip(stages, planned)
+    ]  # fmt: skip
+
+
+def _sizes(
+    setting: Setting, cell: Array, row: int, shapes: Sequence[Size]
+) -> tuple[list[list[Size]], list[Grazing]]:  # fmt: skip
+    """What cells along each axis are to be, and where paths graze."""
     low, high = setting.low[row], setting.high[row]
     width = setting.range[1] - setting.range[0]
     cell = np.broadcast_to(cell, width.shape)
@@ -58,12 +83,16 @@ def plan_axes(
             if not setting.limited[side, i]:
                 continue
             points = _face(setting, low, high, i, place)
-            f, a = setting.flow(points)[i], setting.spread(points).reshape(n, n, *points.shape[1:])
-            if setting.noisy[i] and not shapes:
-                sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
-            elif not setting.noisy[i]:
-                grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place)
-    return [_nodes(low[i], high[i], sizes[i]) for i in range(n)], grazing
+            for time in setting.moments(i):
+                f, a = setting.flow(points, time)[i], setting.spread(points, time).reshape(n, n, *points.shape[1:])
+                if setting.noisy[i] and not shapes:
+                    sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
+                elif not setting.noisy[i]:
+                    grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place, time)
+        for place in (setting.due_low[row, i], setting.due_high[row, i]):
+            if np.isfinite(place):
+                sizes[i].append(_toward(float(place), _SMALLEST * cell[i] * width[i]))
+    return sizes, grazing
 
 
 def _inner(size: float, low: float, high: float) -> Size:
@@ -90,7 +119,7 @@ def _layer(setting: Setting, points: Array, f: Array, a: Array, axis: int, side:
 
 def _graze(
     setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cells: Array, sizes: list[list[Size]],
-    place: float,
+    place: float, time: float,
 ) -> list[Grazing]:  # fmt: skip
     """Refine toward a noise-free limit and about the surface on it where the flow turns."""
     if not f.min() < 0 < f.max():
@@ -103,7 +132,7 @@ def _graze(
         if k != axis:
             moved = chosen.copy()
             moved[k] += 1e-5 * cells[k]
-            slopes[k] = (setting.flow(moved)[axis] - setting.flow(chosen)[axis]) / (1e-5 * cells[k])
+            slopes[k] = (setting.flow(moved, time)[axis] - setting.flow(chosen, time)[axis]) / (1e-5 * cells[k])
     mean = np.abs(slopes).mean(axis=1)
     noise = float(np.mean(np.einsum("ip,ijp,jp->p", slopes, a[:, :, near], slopes)))
     speed = _TYPICAL * float(np.max(mean * cells))

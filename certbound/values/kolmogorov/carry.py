@@ -9,23 +9,36 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from certbound.arrays import Array, Mask
+from certbound.arrays import Array, Index, Mask
 from certbound.rigor.intervals import Interval
-from certbound.values.kolmogorov.axes import Grazing, Size, plan_axes
+from certbound.values.enclosing import enclose
+from certbound.values.kolmogorov.axes import Grazing, Plan, Size, plan_axes
 from certbound.values.kolmogorov.box_setting import Setting
-from certbound.values.kolmogorov.face_exits import face_of, shortfall
+from certbound.values.kolmogorov.changing import ChangingEquation
+from certbound.values.kolmogorov.face_exits import ALWAYS, Face, face_of, shortfall
+from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound, rough_residual
 from certbound.values.kolmogorov.solve import Discretised, discretised
 from certbound.values.kolmogorov.sources import BREADTHS, at_knots, at_nodes
-from certbound.values.kolmogorov.splines import DEGREE, Axis, Sampling, apply_dense, most_on_cells, sliding_max
+from certbound.values.kolmogorov.splines import (
+    DEGREE,
+    Axis,
+    Sampling,
+    apply_dense,
+    most_of_difference,
+    most_on_cells,
+    sliding_max,
+)
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
+_AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
+_OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
 _MARGIN = 0.1  # by which a source exceeds what it pays for
 _LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
@@ -47,31 +60,59 @@ def ramp(y: Array) -> Array:
 
 def time_steps(horizon: float, count: int, layer: float) -> Array:
     """Lengths of the steps from the end backward: small in the end layer, growing to horizon / count."""
-    largest, step = horizon / count, layer / _FIRST
+    return _graded(horizon, horizon / count, layer / _FIRST, _GROWTH)
+
+
+def _graded(length: float, largest: float, first: float, growth: float) -> Array:
+    step = first
     result: list[float] = []
-    while step < largest and sum(result) + step < horizon:
+    while step < largest and sum(result) + step < length:
         result.append(step)
-        step *= _GROWTH
-    rest = horizon - sum(result)
+        step *= growth
+    rest = length - sum(result)
     more = max(int(np.ceil(rest / largest)), 1)
     return np.array(result + [rest / more] * more)
+
+
+def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Array) -> Array:
+    """Times of the knots, from the horizon back: as `time_steps`, with two about every break.
+
+    Before a break, backward in time, a solution that does not fit the new coefficients at faces has a layer in time.
+    """
+    half, largest = HALF * horizon, (horizon - begin) / count
+    ends = horizon - np.append(breaks[::-1], begin)  # passed, backward
+    passed = [0.0]
+    for k, end in enumerate(ends):
+        last = end - half if k < len(breaks) else end
+        first, growth = (layer / _FIRST, _GROWTH) if k == 0 else (layer * _AFTER, _QUICKER)
+        so_far = passed[-1]
+        passed += list(so_far + np.cumsum(_graded(last - so_far, largest, first, growth)))
+        passed[-1] = last
+        if k < len(breaks):
+            passed.append(end + half)
+    times = horizon - np.array(passed)
+    times[-1] = begin
+    return np.asarray(times)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Mesh:
     """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis).
 
-    ``at_limit`` is 1 at limits that paths may leave through, less where the flow is so strong against them that the
-    grid does not resolve the layer: no exits need be counted there. ``leaving`` is the rate at which paths leave the
-    cells about a node.
+    ``inside`` holds the points of the box nearest to the nodes; ``layer`` is the survival at the end that faces allow,
+    ``falls`` the share of it that limits take within the end layer, less where the flow is so strong against paths that
+    the grid does not resolve their layer: no exits need be counted there. ``arrival`` is the rate of arriving in the
+    target, ``leaving`` that of leaving the cells about a node.
     """
 
     nodes: tuple[Array, ...]
     pad: tuple[tuple[int, int], ...]
-    equation: Discretised
+    inside: Array
+    equation: Discretised | ChangingEquation
     layer: Array
-    at_limit: Array
+    falls: Array
     rate: Array
+    arrival: Array | float
     leaving: Array
 
 
@@ -83,15 +124,14 @@ def extended(nodes: Array, before: int, behind: int) -> Array:
 
 
 def mesh_of(
-    setting: Setting,
-    nodes: list[Array],
-    grazing: list[Grazing],
-    row: int,
-    pad: tuple[int, int],
-    kill: bool,
-    span: float,
+    setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool,
+    span: float, fresh: Mask, early: bool = False,
 ) -> Mesh:
-    """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones."""
+    """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones.
+
+    ``fresh``, shape (2, n), says which ends are none of the stage after this; ``early`` whether paths arrive in some
+    cells before the target, or in its first cells.
+    """
     n = setting.dimension
     low, high = setting.low[row], setting.high[row]
     free = {(one.axis, one.side) for one in grazing}
@@ -101,17 +141,21 @@ def mesh_of(
     shape = points.shape[1:]
     inside = np.clip(points, low.reshape(-1, *[1] * n), high.reshape(-1, *[1] * n))
     flow, spread = setting.flow(inside), setting.spread(inside).reshape(n, n, *shape)
+    least, most, noise = _extremes(setting, inside, flow, spread) if setting.changing else (flow, flow, spread)
+    size, slowest = np.maximum(most, -least), np.clip(0, least, most)
     dead, at_limit, layer, rate = np.zeros(shape, bool), np.zeros(shape), np.ones(shape), np.zeros(shape)
     for i in range(n):
         for side, place in ((0, 0), (1, shape[i] - 1)):
             face = tuple(place if k == i else slice(None) for k in range(n))
-            out = (2 * side - 1) * flow[i][face]
-            leaves = (spread[i, i][face] > 0) | (out >= 0)
+            out = most[i][face] if side else -least[i][face]
+            leaves = (noise[i, i][face] > 0) | (out >= 0)
             dead[face] |= leaves
             against = -out * abs(lines[i][place] - lines[i][1 if side == 0 else -2])
-            resolved = ramp(2 - against / (_RESOLVED * spread[i, i][face] + 1e-300)) if setting.noisy[i] else 1.0
+            resolved = ramp(2 - against / (_RESOLVED * noise[i, i][face] + 1e-300)) if setting.noisy[i] else 1.0
             at_limit[face] = np.maximum(at_limit[face], leaves * float(setting.limited[side, i]) * resolved)
-            width = np.sqrt(spread[i, i][face].max() * span) or np.maximum(out, 0).mean() * span
+            width = np.sqrt(max(noise[i, i][face].max(), 0.0) * span) or np.maximum(out, 0).mean() * span
+            if not fresh[side, i]:
+                continue
             third = abs(lines[i][place] - lines[i][3 if side == 0 else -4])
             layer = layer * ramp(np.abs(points[i] - lines[i][place]) / max(width, third))
     for i in range(n):
@@ -120,28 +164,90 @@ def mesh_of(
                 edge = (low, high)[side][i]
                 out = (2 * side - 1) * (points[i] - edge)
                 beyond = abs(lines[i][-1 if side else 0] - edge)
-                speed = np.abs(flow[i]) / beyond + spread[i, i] / beyond**2
+                speed = size[i] / beyond + noise[i, i] / beyond**2
                 rate += _KILL * speed * ramp(out / beyond)
     for one in grazing:
         edge = (low, high)[one.side][one.axis]
         out = (2 * one.side - 1) * (points[one.axis] - edge)
         if pads[one.axis][one.side]:
             beyond = abs(lines[one.axis][-1 if one.side else 0] - edge)
-            rate += _KILL * np.abs(flow[one.axis]).max() / beyond * ramp(out / beyond)
+            rate += _KILL * size[one.axis].max() / beyond * ramp(out / beyond)
         if kill:
             width = (0.3 * _SOFT**3 + 2) * one.scale
-            rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(flow[one.axis] / (_SOFT * one.speed))
+            rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(slowest[one.axis] / (_SOFT * one.speed))
+    arrival: Array | float = 0.0
     layer[dead] = 0
-    equation = discretised(lines, flow, spread, dead, rate)
-    return Mesh(nodes=lines, pad=pads, equation=equation, layer=layer, at_limit=at_limit, rate=rate,
-                leaving=_leaving(lines, flow, spread))  # fmt: skip
+    falls = at_limit
+    if setting.target is not None:
+        depth, soonest = _depth(setting.target[:, row], lines, points), np.zeros(shape)
+        for i in range(n):
+            width = np.maximum(3 * np.gradient(lines[i]), 1e-300).reshape([-1 if k == i else 1 for k in range(n)])
+            soonest = soonest + size[i] / width + noise[i, i] / width**2
+        there = ramp(1 + depth if early else depth)
+        arrival = _KILL * soonest * there
+        rate += arrival
+        layer += (1 - layer) * there
+        falls *= 1 - there
+    equation: Discretised | ChangingEquation = (
+        ChangingEquation(lines, dead, rate, setting.noisy) if setting.changing
+        else discretised(lines, flow, spread, dead, rate)
+    )  # fmt: skip
+    return Mesh(
+        nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, falls=falls, rate=rate,
+        arrival=arrival, leaving=_leaving(lines, size, noise),
+    )  # fmt: skip
 
 
-def _leaving(lines: tuple[Array, ...], flow: Array, spread: Array) -> Array:
-    rate = np.zeros(flow.shape[1:])
+def _depth(target: Array, lines: tuple[Array, ...], points: Array) -> Array:
+    """How deep nodes lie in the target, in units of three cells at its faces, negative before it.
+
+    Where it reaches beyond the grid it has no face.
+    """
+    depth = np.full(points.shape[1:], np.inf)
+    for i, line in enumerate(lines):
+        for side in (0, 1):
+            end = target[side, i]
+            if line[0] < end < line[-1]:
+                place = int(np.clip(np.searchsorted(line, end), 3, len(line) - 4))
+                cells = (line[place + 3] - line[place - 3]) / 2
+                depth = np.minimum(depth, (1 - 2 * side) * (points[i] - end) / cells)
+            elif (end >= line[-1]) != bool(side):
+                depth = np.full_like(depth, -np.inf)
+    return depth
+
+
+def _across(marked: Mask, axis: int, dimension: int) -> tuple[slice | Mask, ...]:
+    """An index of what is marked along one axis."""
+    return tuple(marked if k == axis else slice(None) for k in range(dimension))
+
+
+def _common(axes: tuple[Axis, ...], others: tuple[Axis, ...]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """The cells that two grids with nodes in common share, in each of them."""
+    own: list[slice] = []
+    places: list[slice] = []
+    for axis, other in zip(axes, others):
+        low, high = max(axis.nodes[0], other.nodes[0]), min(axis.nodes[-1], other.nodes[-1])
+        for line, parts in ((axis.nodes, own), (other.nodes, places)):
+            parts.append(slice(int(np.searchsorted(line, low)), int(np.searchsorted(line, high))))
+    return tuple(own), tuple(places)
+
+
+def _extremes(setting: Setting, points: Array, flow: Array, spread: Array) -> tuple[Array, Array, Array]:
+    """Least and largest f and largest a over moments and disturbances."""
+    least, most, noise = flow, flow, spread
+    for time in setting.moments():
+        for acting in setting.nodes:
+            one = setting.flow(points, time, acting)
+            least, most = np.minimum(least, one), np.maximum(most, one)
+        noise = np.maximum(noise, setting.spread(points, time).reshape(spread.shape))
+    return least, most, noise
+
+
+def _leaving(lines: tuple[Array, ...], size: Array, noise: Array) -> Array:
+    rate = np.zeros(size.shape[1:])
     for i, line in enumerate(lines):
         width = np.gradient(line).reshape([-1 if k == i else 1 for k in range(len(lines))])
-        rate += np.abs(flow[i]) / width + spread[i, i] / width**2
+        rate += size[i] / width + noise[i, i] / width**2
     return rate
 
 
@@ -153,6 +259,10 @@ def _nothing(part: float) -> float:
     return 0.0
 
 
+def _same(value: Array | float, part: float) -> Array | float:
+    return value
+
+
 def _between(first: Array, last: Array, part: float) -> Array:
     return (1 - part) * first + part * last
 
@@ -162,8 +272,7 @@ def _later(given: Callable[[float], Array | float], begin: float, step: float, p
 
 
 def _generator(setting: Setting, axes: tuple[Axis, ...]) -> Generator:
-    always = Interval.point(0.0)
-    return Generator.of(axes, setting.drift.on(axes, always), setting.square.on(axes, always))
+    return Generator.of(axes, *((one.drift.on(axes, ALWAYS), one.square.on(axes, ALWAYS)) for one in setting.operators))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -188,52 +297,173 @@ class Side:
         Steps over the horizon.
     above : bool
         From above or from below.
-    shapes : sequence of callable, optional
-        A width at every place of each axis; without them cells follow the scales of the equation.
+    later : Side, optional
+        Of the stage after this one.
+    plan : (nodes, grazing), optional
+        Of `plan_axes`, where there are several stages.
     """
 
     def __init__(
-        self, setting: Setting, cell: Array, steps: int, above: bool, shapes: Sequence[Size] = (),
-        parts: int = 4,
+        self, setting: Setting, cell: Array, steps: int, above: bool, parts: int = 4, later: Side | None = None,
+        plan: Plan | None = None,
     ) -> None:  # fmt: skip
-        self.setting, self.above, self.cell, self.count = setting, above, cell, steps
-        row = 0 if above else 1
-        self.layer = END * float(np.mean(cell)) * setting.horizon
-        nodes, grazing = plan_axes(setting, cell, row, shapes)
+        self.setting, self.above, self.later, self.cell, self.count = setting, above, later, cell, steps
+        row = self.row = 0 if above else 1
+        span = setting.horizon - setting.begin
+        self.layer = END * float(np.mean(cell)) * span
+        nodes, grazing = plan or plan_axes([setting], cell, row)[0]
+        fresh = np.ones((2, len(nodes)), dtype=bool)
+        if later is not None:
+            after = later.setting
+            fresh = np.array([after.low[row] != setting.low[row], after.high[row] != setting.high[row]])
         self.axes = tuple(Axis(line, Sampling(parts)) for line in nodes)
-        self.mesh = mesh_of(setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer)
-        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer)
-        longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
-        self.steps = time_steps(setting.horizon * longer, steps, self.layer)
-        self.generator, self.sketch = (
-            _generator(setting, axes) for axes in (self.axes, tuple(Axis(line, Sampling(_SKETCH)) for line in nodes))
+        self.mesh = mesh_of(
+            setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh, not above
         )
+        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh)
+        longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
+        self.steps = time_steps(span * longer, steps, self.layer)
+        self._follow_changes(int(np.ceil(setting.pace * steps)))
+        sketched = tuple(Axis(line, Sampling(_SKETCH)) for line in nodes)
+        self.generator, self.sketch = (_generator(setting, axes) for axes in (self.axes, sketched))
         self.maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.mesh.nodes)]
         self.carried_maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.carrier.nodes)]
         n, noisy = setting.dimension, setting.noisy
+        slabs = self._slabs() if setting.timed else ALWAYS
+        every = [Interval(a, b) for a, b in setting.disturbance.T]
         self.faces = [
-            face_of(self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])))
-            for i in range(n)
-            for side in (0, 1)
-        ]
-        self.passes = 0
+            face_of(
+                self.axes, setting.drift, noisy[i], i, side, self._goal(bool(setting.limited[side, i])), slabs, every
+            )
+            for i in range(n) for side in (0, 1)
+        ]  # fmt: skip
+        self.arrived = self._cells_arrived(setting)
+        if self.arrived.any():
+            self.faces = [self._before_target(face) for face in self.faces] + self._target_faces()
         self.values: list[Array] = []
         self.rates: list[Array] = []
+        self.policy: list[Index | None] = []
+        self.passes = 0
         self.best: Best | None = None
 
+    def follow(self, k: int) -> None:
+        """Set the equation of the carried error to knot ``k``."""
+        self._now(self.carrier, k)
+
     def on(self, shapes: Sequence[Size]) -> Side:
-        """The same side on axes of other shapes."""
-        return Side(self.setting, self.cell, self.count, self.above, shapes)
+        """The same side, of the only stage, on axes of other shapes."""
+        plan = plan_axes([self.setting], self.cell, self.row, shapes)[0]
+        return Side(self.setting, self.cell, self.count, self.above, plan=plan)
 
     @property
     def begun(self) -> bool:
         """Whether the next source is still about the residual, and not above it."""
         return self.passes < len(BREADTHS) - 1
 
+    def _cells_arrived(self, setting: Setting) -> Mask:
+        """Cells within the target of a stage, whose faces stand on nodes."""
+        shape = tuple(axis.cells for axis in self.axes)
+        if setting.target is None:
+            return np.zeros(shape, dtype=bool)
+        result = np.ones(shape, dtype=bool)
+        for k, axis in enumerate(self.axes):
+            low, high = setting.target[:, self.row, k]
+            own = (axis.nodes[:-1] >= low) & (axis.nodes[1:] <= high)
+            result &= own.reshape([-1 if j == k else 1 for j in range(len(self.axes))])
+        return result
+
+    def _before_target(self, face: Face) -> Face:
+        """A face of the box without its cells within the target."""
+        there = np.take(self.arrived, -1 if face.side else 0, axis=face.axis)
+        return replace(face, leaves=face.leaves & ~there)
+
+    def _target_faces(self) -> list[Face]:
+        """Faces of the target within the box, at which v is to be at least 0."""
+        result = []
+        for k, axis in enumerate(self.axes):
+            along = np.flatnonzero(self.arrived.any(axis=tuple(j for j in range(len(self.axes)) if j != k)))
+            leaves = np.asarray(self.arrived.any(axis=k))
+            for side, place in ((0, int(along[0])), (1, int(along[-1]) + 1)):
+                if 0 < place < axis.cells:
+                    result.append(Face(axis=k, side=side, leaves=leaves, goal=0.0, place=place))
+        return result
+
+    def _follow_changes(self, steps: int) -> None:
+        """Knots, and what is known of the factors between them, where the generator changes."""
+        setting, begin, horizon = self.setting, self.setting.begin, self.setting.horizon
+        self.brief = np.zeros(len(self.steps), dtype=bool)  # slabs about breaks: too short to be carried
+        self.clock: Array | None = None
+        self.times = horizon - np.append(0.0, np.cumsum(self.steps))
+        if setting.timed or setting.staged:  # a stage is as long as it is
+            self.times = knots_of(begin, horizon, steps, self.layer, setting.breaks)
+            self.steps = -np.diff(self.times)
+            self.brief = self.steps < 4 * HALF * horizon
+            self.clock = 2 * CLOCK * horizon / self.steps
+        self.factors = [
+            None if one.factor is None
+            else factor_of(one.factor, self.times, (begin, horizon), setting.nodes, setting.gaps)
+            for one in setting.operators
+        ]
+        if setting.changing:  # that no factor hides where the model is undefined
+            ends = [axis.nodes for axis in self.axes]
+            lines = [np.meshgrid(*rows, indexing="ij", sparse=True) for rows in zip(*((e[:-1], e[1:]) for e in ends))]
+            cells = [Interval(low, high) for low, high in zip(*lines)]
+            whole = Interval(begin, horizon)
+            enclose(setting.drift.tape, [whole, *cells, *(Interval(a, b) for a, b in setting.disturbance.T)])
+            enclose(setting.square.tape, [whole, *cells])
+
+    def _slabs(self) -> Interval:
+        """Times that hold the slabs."""
+        horizon = self.setting.horizon
+        off = CLOCK * horizon
+        low, high = self.times[1:] - off, self.times[:-1] + off
+        return Interval(np.maximum(low, self.setting.begin), np.minimum(high, horizon))
+
+    def _now(self, mesh: Mesh, k: int, a: Array | None = None) -> None:
+        """Set an equation to knot ``k``; with the survival ``a``, choose the worst disturbances there from it."""
+        equation, setting = mesh.equation, self.setting
+        if not isinstance(equation, ChangingEquation):
+            return
+        n, time = setting.dimension, float(self.times[k])
+        if a is not None and len(self.policy) == k:
+            self.policy.append(self._worst(mesh, time, a) if len(setting.nodes) > 1 else None)
+        chosen = self.policy[k]
+        if chosen is not None and chosen.shape != equation.shape:
+            around = [(p - q, r - s) for (p, r), (q, s) in zip(mesh.pad, self.mesh.pad)]
+            chosen = np.pad(chosen, around, mode="edge")
+        acting = setting.nodes[0] if chosen is None else np.moveaxis(setting.nodes[chosen], -1, 0)
+
+        def coefficients(time: float) -> tuple[Array, Array]:
+            spread = setting.spread(mesh.inside, time).reshape(n, n, *equation.shape)
+            return setting.flow(mesh.inside, time, acting), spread
+
+        equation.now(time, coefficients)
+
+    def _worst(self, mesh: Mesh, time: float, a: Array) -> Index:
+        """Of the disturbances' nodes, at each node of the mesh, the one that lowers survival most."""
+        slopes = np.gradient(a, *mesh.nodes)
+        loss = [
+            -sum(f * slope for f, slope in zip(self.setting.flow(mesh.inside, time, acting), slopes))
+            for acting in self.setting.nodes
+        ]
+        return np.asarray(np.argmax(loss, axis=0), dtype=np.intp)
+
+    @property
+    def stages(self) -> list[Side]:
+        """This side and those of the stages after it."""
+        return [self, *([] if self.later is None else self.later.stages)]
+
     @property
     def work(self) -> int:
-        """Cells of space and time."""
-        return int(np.prod([axis.cells for axis in self.axes])) * len(self.steps)
+        """Cells of space and time of this and later stages, each as often as it costs one of a model that does not
+        change."""
+        return self.own_work + (0 if self.later is None else self.later.work)
+
+    @property
+    def own_work(self) -> int:
+        """The same of this stage alone."""
+        times = _OFTEN[0] + _OFTEN[1] * len(self.setting.nodes) if self.setting.changing else 1.0
+        return int(times * np.prod([axis.cells for axis in self.axes]) * len(self.steps))
 
     @property
     def finite(self) -> bool:
@@ -249,8 +479,27 @@ class Side:
         return [shortfall(self.axes, face, values, rates, self.steps) for face in self.faces]
 
     def shortfall_at_end(self) -> Array:
-        """What v(T) lacks of 0 on every cell."""
-        return np.asarray(np.maximum(most_on_cells(self.axes, -self.values[0][None])[0], 0.0))
+        """On every cell, what v at the stage's end lacks of 0, of what a limit that is due asks, or of the next v."""
+        lacks = most_on_cells(self.axes, -self.values[0][None])[0]
+        if self.later is not None:
+            own, places = _common(self.axes, self.later.axes)
+            open_ = lacks + (1.0 if self.above else 0.0)  # beyond ends of the next stage that are no limits
+            difference = most_of_difference(
+                self.axes, self.later.axes, self.values[0], self.later.values[-1], own, places
+            )  # fmt: skip
+            beyond = self._cells_beyond(self.later.setting, limits=True)
+            lost = lacks + self._goal(True)
+            lacks = open_
+            lacks[own] = difference
+            lacks[beyond] = lost[beyond]
+        due = self._cells_beyond(self.setting, limits=False)
+        if due.any():
+            lacks[due] = (most_on_cells(self.axes, -self.values[0][None])[0] + self._goal(True))[due]
+        if self.later is not None:
+            arrived = self._cells_arrived(self.later.setting)  # there the next v may be anything
+            lacks[arrived] = most_on_cells(self.axes, -self.values[0][None])[0][arrived]
+            lacks[self.arrived] = 0.0
+        return np.asarray(np.maximum(lacks, 0.0))
 
     def lacking(self) -> float:
         """The most that v lacks at the end and at faces where paths can leave."""
@@ -261,23 +510,78 @@ class Side:
         if self.best is None or bound < self.best.bound:  # later passes replace the arrays and do not change them
             self.best = Best(value=value, bound=bound, values=list(self.values), rates=list(self.rates))
 
+    def _cells_beyond(self, setting: Setting, limits: bool) -> Mask:
+        """Cells beyond a limit of a stage, or beyond one that is due at its end; both stand on nodes."""
+        result = np.zeros(tuple(axis.cells for axis in self.axes), dtype=bool)
+        for k, axis in enumerate(self.axes):
+            low, high = setting.due_low[self.row, k], setting.due_high[self.row, k]
+            if limits:
+                low, high = (
+                    ends[self.row, k] if there else far for ends, there, far in
+                    zip((setting.low, setting.high), setting.limited[:, k], (-np.inf, np.inf))
+                )  # fmt: skip
+            out = (axis.nodes[1:] <= low) | (axis.nodes[:-1] >= high)
+            result |= out.reshape([-1 if j == k else 1 for j in range(len(self.axes))])
+        return result
+
+    def _handed_over(self) -> Array:
+        """Survival at the stage's end at the mesh's nodes: that of the next stage, softly cut where a limit is due."""
+        n, shape = len(self.axes), self.mesh.equation.shape
+        lines = [np.clip(line, axis.nodes[0], axis.nodes[-1]) for line, axis in zip(self.mesh.nodes, self.axes)]
+        a = np.ones(shape)
+        if self.later is not None:
+            v, setting = self.later.values[-1], self.later.setting
+            for k, (line, axis) in enumerate(zip(lines, self.later.axes)):
+                v = axis.at_points(np.clip(line, axis.nodes[0], axis.nodes[-1]), 0).along(v, k)
+            a = np.ascontiguousarray(1 - v if self.above else 1 + v)
+            for beyond_limits in (False, True):
+                for k, line in enumerate(lines):
+                    for side, end in enumerate((setting.low[self.row, k], setting.high[self.row, k])):
+                        if setting.limited[side, k] == beyond_limits:
+                            out = (2 * side - 1) * (line - end) > 0
+                            given = 0.0 if beyond_limits or self.above else 1.0
+                            a[_across(out, k, n)] = given
+        for k, line in enumerate(lines):
+            for side, rows in enumerate((self.setting.due_low, self.setting.due_high)):
+                end = rows[self.row, k]
+                if np.isfinite(end):
+                    width = self._soft(k, float(end))
+                    within = (1 - 2 * side) * (line - end) / width
+                    a = a * ramp(within if self.above else 1 + within).reshape([-1 if j == k else 1 for j in range(n)])
+        return a
+
+    def _soft(self, k: int, end: float) -> float:
+        """How far a limit that is due reaches: what noise smooths within the layer, and three cells."""
+        axis = self.axes[k]
+        place = int(np.clip(np.searchsorted(axis.nodes, end), 3, axis.cells - 3))
+        cells = float(axis.nodes[place + 3] - axis.nodes[place - 3]) / 2
+        spread = self.setting.spread(self.mesh.inside, self.setting.horizon)[k * len(self.axes) + k]
+        return max(cells, float(np.sqrt(max(np.median(spread), 0.0) * self.layer)))
+
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
         equation, span = self.mesh.equation, self.layer
-        above, limit = self.above, self.mesh.at_limit
+        above, limit = self.above, self.mesh.falls
 
         def fall(tau: float) -> Array | float:
             if above or tau >= span:
                 return 0.0
-            return np.asarray(-30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit)
+            return np.asarray(-30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit * first)
 
-        a = self.mesh.layer.copy() if above else np.ones(equation.shape)
+        self.values, self.rates, self.policy, self.passes = [], [], [], 0
+        a = self._handed_over()
+        a = a * self.mesh.layer if above else a
+        first = a.copy()
         tau = 0.0
-        self._keep(a, equation.speed(a, 0.0, fall(tau)))
-        for step in self.steps:
-            a = equation.step(a, step, _nothing, partial(_later, fall, tau, step))
+        self._now(self.mesh, 0, a)
+        arrival = self.mesh.arrival
+        self._keep(a, equation.speed(a, arrival, fall(tau)))
+        for k, step in enumerate(self.steps):
+            if not self.brief[k]:
+                a = equation.step(a, step, partial(_same, arrival), partial(_later, fall, tau, step))
             tau += step
-            self._keep(a, equation.speed(a, 0.0, fall(tau)))
+            self._now(self.mesh, k + 1, a)
+            self._keep(a, equation.speed(a, arrival, fall(tau)))
 
     def _keep(self, a: Array, speed: Array) -> None:
         sign = -1.0 if self.above else 1.0
@@ -286,18 +590,23 @@ class Side:
 
     def residuals(self, rough: bool = False) -> list[Array]:
         """A bound of v_t + L v on every cell, slab by slab from the end backward; ``rough`` about that, and quicker."""
-        generator = self.sketch if rough else self.generator
-        lattice = int(np.prod([axis.sampling.parts for axis in generator.axes]))
-        many = max(1, _BATCH * len(self.steps) // (lattice * self.work))
+        lattice = int(np.prod([axis.sampling.parts for axis in (self.sketch if rough else self.generator).axes]))
+        many = max(1, _BATCH * len(self.steps) // (lattice * self.own_work))
         with ThreadPoolExecutor(2) as pool:
-            parts = pool.map(lambda k: self._bounded(generator, rough, k, k + many), range(0, len(self.steps), many))
+            parts = pool.map(lambda k: self._bounded(rough, k, k + many), range(0, len(self.steps), many))
             return [bound for part in parts for bound in part]
 
-    def _bounded(self, generator: Generator, rough: bool, begin: int, end: int) -> list[Array]:
+    def _bounded(self, rough: bool, begin: int, end: int) -> list[Array]:
         steps = self.steps[begin:end]
         values, rates = (np.array(rows[begin : begin + len(steps) + 1]) for rows in (self.values, self.rates))
-        bound = (rough_residual if rough else residual_bound)(generator, values, rates, steps)
-        return list(np.where(self._decided(values, rates, steps), 0.0, np.maximum(bound, 0.0)))
+        factors = [None if one is None else one.on(slice(begin, end)) for one in self.factors]
+        clock = None if self.clock is None else self.clock[begin:end]
+        if rough:
+            bound = rough_residual(self.sketch, values, rates, steps, factors, worst=self.above)
+        else:
+            bound = residual_bound(self.generator, values, rates, steps, factors, worst=self.above, clock=clock)
+        done = self._decided(values, rates, steps) | self.arrived
+        return list(np.where(done, 0.0, np.maximum(bound, 0.0)))
 
     def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:
         """Cells and slabs on which v is so large that nothing is asked of it any more."""
@@ -310,15 +619,19 @@ class Side:
 
     def correct(self, residuals: list[Array]) -> None:
         """Solve for the error that the residuals leave, and for what v lacks at exits and at the end; add it to v."""
-        equation, breadth = self.carrier.equation, min(self.passes, len(BREADTHS) - 1)
-        spread = partial(at_nodes, pads=self.carrier.pad, breadth=BREADTHS[breadth])
+        equation, breadth = self.carrier.equation, BREADTHS[min(self.passes, len(BREADTHS) - 1)]
+        spread = partial(at_nodes, pads=self.carrier.pad, breadth=breadth)
+        residuals = [np.zeros_like(r) if brief else r for r, brief in zip(residuals, self.brief)]
         slabs = [spread(r) + b for r, b in zip(residuals, self._at_exits(spread))]
-        ends = [(1 + _MARGIN) * s * equation.live for s in at_knots(slabs, self.steps, BREADTHS[breadth])]
+        ends = [(1 + _MARGIN) * s * equation.live for s in at_knots(slabs, self.steps, breadth)]
         missing = (1 + _MARGIN) * spread(self.shortfall_at_end()) * equation.live
+        self._now(self.carrier, 0)
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
         self._add(0, e, equation.speed(e, ends[0]))
         for k, step in enumerate(self.steps):
-            e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
+            if not self.brief[k]:
+                e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
+            self._now(self.carrier, k + 1)
             self._add(k + 1, e, equation.speed(e, ends[k + 1]))
         self.passes += 1
 
@@ -331,12 +644,14 @@ class Side:
         carrier = self.carrier
         total = [np.zeros(carrier.equation.shape) for _ in self.steps]
         for face, missing in zip(self.faces, self.shortfalls()):
-            pad = carrier.pad[face.axis][face.side]
             if not missing.any():
                 continue
-            length = carrier.equation.shape[face.axis]
+            pad, length = carrier.pad[face.axis][face.side], carrier.equation.shape[face.axis]
             beyond = slice(length - pad, length) if face.side else slice(0, pad)
             at = slice(length - pad - 1, length - pad) if face.side else slice(pad, pad + 1)
+            if face.place is not None:
+                first = face.place + carrier.pad[face.axis][0]
+                beyond = slice(0, first + 1) if face.side else slice(first, length)
             place, on = (
                 tuple(part if k == face.axis else slice(None) for k in range(len(self.axes))) for part in (beyond, at)
             )
@@ -344,7 +659,7 @@ class Side:
                 if one.any():
                     around = spread(np.expand_dims(one, face.axis), skip=face.axis)
                     total[k][place] = np.maximum(total[k][place], _REACHED * around * carrier.rate[place])
-                    if not self.setting.noisy[face.axis]:
+                    if not self.setting.noisy[face.axis] and face.place is None:
                         total[k][on] = np.maximum(total[k][on], _ON_FACE * around * carrier.leaving[on])
         return total
 

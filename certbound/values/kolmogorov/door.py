@@ -13,10 +13,12 @@ from certbound.arrays import Array
 from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import GaussianStart
-from certbound.values.kolmogorov.box_setting import Setting, setting_of
+from certbound.values.kolmogorov.axes import plan_axes
+from certbound.values.kolmogorov.box_setting import Setting, stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.shares import Shape, better_shapes
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
+from certbound.values.kolmogorov.start_law import StartMean
 from certbound.values.kolmogorov.witness import Witness
 from certbound.watch import poll
 
@@ -31,6 +33,7 @@ _GROWTH = 6.0  # the largest factor of work from one grid to the next
 _LEAST = 1.5  # the smallest one that is worth it
 _SHARE, _ORDER = 0.8, 2.0  # of what the target leaves, that an error may take; how fast errors fall with cells
 _FAR = 2.0  # ratio of the coarsest solution to the target, beyond which it says which bound decides
+_FEWEST = 8  # steps of a stage
 _STARTS = 9  # points along each side of a start set
 RATE = {2: 1.8e5, 3: 7.0e4}
 """Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
@@ -72,7 +75,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     Parameters
     ----------
     problem : Problem
-        Continuous time, two or three states, limits along the coordinates; any noise.
+        Continuous time, two or three states, limits along the coordinates, each in a window of its own; any noise.
     seconds : float
         How long to refine, in units of work (`RATE`): the bounds do not depend on the machine or its load. Nothing is
         proved where the coarsest grid takes more.
@@ -92,37 +95,40 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     EnclosureError
         The model is undefined somewhere in the safe set.
     """
-    setting = setting_of(problem)
+    stages = stages_of(problem)
+    setting = stages[0]
     if setting.dimension not in _COARSEST:
         raise InfeasibleError("values with a carried error serve two and three states here.")
     starts, cell = starts_in(problem), _COARSEST[setting.dimension]
     budget = seconds * RATE[setting.dimension]
     lower, upper, work, runs = 0.0, 1.0, 0.0, 0
-    sides: tuple[bool, ...] = (True, False)
+    only = bool(problem.unknown) or setting.torn  # constants are no worst disturbance
+    sides: tuple[bool, ...] = (True,) if only else (True, False)
     shapes: dict[bool, Shapes] = {}
     kept: tuple[Witness, ...] = ()
     while True:
         before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
         for above in sides:
-            side = Side(setting, np.full(setting.dimension, cell), count, above, _scaled(shapes.get(above), cell))
+            side = side_of(stages, cell, count, above, _scaled(shapes.get(above), cell))
             cells = cells_of(side.axes)
             if not work and len(sides) * _USUAL * side.work > budget:
                 yield Bounds(lower=0.0, upper=1.0, cells=cells, steps=count, runs=0, estimate=math.nan, work=0.0)
                 return
-            side.propose()
+            for stage in side.stages[::-1]:
+                stage.propose()
             estimate = abs(largest_at_start(side, starts)[0])
             if above and len(sides) > 1 and estimate > _FAR * delta > 0:
                 continue
-            rounds = 0 if above in shapes else _ROUNDS
+            rounds = 0 if above in shapes or side.later is not None else _ROUNDS
             side, residuals = adapted(side, starts, rounds)
             cells, estimate = cells_of(side.axes), abs(largest_at_start(side, starts)[0])
             last = (1 + _LEAST) * _USUAL * side.work > budget - work
             target = math.inf if last or not delta else delta if above else -delta
-            if side.finite:
-                shapes[above] = (cell, better_shapes(side, residuals, starts.points))
+            if residuals is not None:
+                shapes[above] = (cell, better_shapes(side, residuals, starts.places))
             bound, value, passes = refined(side, starts, target, residuals)
             work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
-            kept += Witness.of(side)
+            kept += () if setting.changing or setting.staged or starts.means else Witness.of(side)
             lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
             yield Bounds(
                 lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work,
@@ -141,7 +147,7 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
             needed = (carried / max(room, 1e-300)) ** ((setting.dimension + 1) / _ORDER)
             growth = max(min(growth, needed), _LEAST)
             growth = min(growth * len(sides), _GROWTH)
-            sides = (estimate < delta,)
+            sides = (estimate < delta or only,)
         cell /= growth ** (1 / (setting.dimension + 1))
 
 
@@ -153,16 +159,32 @@ def _scaled(shapes: Shapes | None, cell: float) -> list[Shape]:
     return [] if shapes is None else [shape.scaled(cell / shapes[0]) for shape in shapes[1]]
 
 
-def adapted(side: Side, starts: Starts, rounds: int) -> tuple[Side, list[Array]]:
+def adapted(side: Side, starts: Starts, rounds: int) -> tuple[Side, list[Array] | None]:
     """A grid of about as many cells that is better for this problem, and about its residuals."""
+    if side.later is not None:
+        return side, None
     while side.finite:
         residuals = side.residuals(rough=True)
         if not rounds:
             return side, residuals
-        side = side.on(better_shapes(side, residuals, starts.points))
+        side = side.on(better_shapes(side, residuals, starts.places))
         side.propose()
         rounds -= 1
-    return side, []
+    return side, None
+
+
+def side_of(
+    stages: Sequence[Setting], cell: float, count: int, above: bool, shapes: Sequence[Shape] = ()
+) -> Side:  # fmt: skip
+    """One bound on one grid, of the first of the stages; ``count`` steps go over all of them."""
+    cells = np.full(stages[0].dimension, cell)
+    plans = plan_axes(stages, cells, 0 if above else 1, shapes)
+    later: Side | None = None
+    for one, plan in zip(reversed(stages), reversed(plans)):
+        share = (one.horizon - one.begin) / stages[-1].horizon
+        later = Side(one, cells, max(math.ceil(share * count), _FEWEST), above, later=later, plan=plan)
+    assert later is not None
+    return later
 
 
 def refined(
@@ -173,7 +195,10 @@ def refined(
     Passes end early once v at the start, which only grows, is beyond ``target``; the first ``residuals`` may be known.
     The bound, v there, and what it took in passes.
     """
-    best, passes = math.inf, 0.0
+    best, passes, rest = math.inf, 0.0, 0.0
+    if side.later is not None:
+        rest = _settled(side.later, _PAID * abs(largest_at_start(side, starts)[0]))
+        side.propose()
     while True:
         poll("solving for the error that is left")
         if not side.finite:
@@ -184,32 +209,73 @@ def refined(
             residuals = side.residuals(rough)
             passes += _ROUGH if rough else 1.0
         if not rough:
-            left = sum(float(h) * float(r.max()) for h, r in zip(side.steps, residuals))
-            missing = side.lacking()
-            bound = value + (left + missing) * (1 + 1e-9) + 1e-15
+            left, missing = _unpaid(side, residuals)
+            bound = value + (left + rest + missing) * (1 + 1e-9) + 1e-15
             best = min(best, bound)
             side.remember(value, bound)
-            paid = left + missing <= _PAID * abs(value)
+            paid = left + rest + missing <= _PAID * abs(value)
         if paid or hopeless or side.passes == _PASSES:
             return best, value, passes
         side.correct(residuals)
         residuals = None
 
 
+def _unpaid(side: Side, residuals: Sequence[Array]) -> tuple[float, float]:
+    """What is left of the residuals, and the most that v lacks at the end and at faces."""
+    lengths = side.steps if side.clock is None else side.steps * (1 + side.clock)
+    left = sum(float(h) * float(r.max()) for h, r in zip(lengths, residuals))
+    return left, side.lacking()
+
+
+def _settled(side: Side, enough: float) -> float:
+    """Passes for a later stage until at most ``enough`` is left; what is left of it and of those after it."""
+    rest = 0.0
+    if side.later is not None:
+        rest = _settled(side.later, enough)
+        side.propose()
+    unpaid = math.inf
+    while True:
+        poll("solving for the error that is left of a later stage")
+        if not side.finite:
+            return math.inf
+        rough = side.begun
+        residuals = side.residuals(rough)
+        unpaid = math.inf if rough else sum(_unpaid(side, residuals))
+        if unpaid <= enough or side.passes == _PASSES:
+            break
+        side.correct(residuals)
+    return (rest + unpaid) * (1 + 1e-9)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Starts:
-    """Boxes around the starts, and points that surely are starts, shapes (S, n) and (P, n)."""
+    """Boxes around the starts, points that surely are starts, shapes (S, n) and (P, n), and normal starts."""
 
     low: Array
     high: Array
     points: Array
+    means: tuple[StartMean, ...] = ()
+
+    @property
+    def places(self) -> Array:
+        """Starts that stand for all of them."""
+        return np.concatenate([self.points, *(mean.places for mean in self.means)])
 
 
 def starts_in(problem: Problem) -> Starts:
-    lows, highs, points = [], [], []
+    n = problem.system.dimension
+    means: list[StartMean] = []
+    lows: list[Array] = []
+    highs: list[Array] = []
+    points: list[Array] = []
     for start in problem.starts:
+        if isinstance(start, GaussianStart) and start.spread:
+            means.append(StartMean(start))
+            continue
         if isinstance(start, GaussianStart):
-            raise InfeasibleError("values with a carried error do not serve random starts yet.")
+            for rows in (lows, highs, points):
+                rows.append(start.middle)
+            continue
         hull = start.hull(0.0)
         low, high = np.asarray(hull.lo, dtype=float), np.asarray(hull.hi, dtype=float)
         lows.append(low)
@@ -220,15 +286,25 @@ def starts_in(problem: Problem) -> Starts:
             point = middle + np.array(share) * (high - low) / 2 * (1 - 1e-9)
             if start.contains(point):
                 points.append(point)
-    return Starts(low=np.array(lows), high=np.array(highs), points=np.array(points))
+    low, high, within = (np.array(rows).reshape(-1, n) for rows in (lows, highs, points))
+    return Starts(low=low, high=high, points=within, means=tuple(means))
 
 
 def largest_at_start(side: Side, starts: Starts) -> tuple[float, float]:
     """v(0, .) over the starts: roughly at the worst of them, and the certified number of the side.
 
     From above that is an upper bound over all starts; from below the least of v over some of them, rounded up. Of
-    starts beyond the box of the axes, where v is not known, 1 is said from above and 0 from below.
+    starts beyond the box of the axes, where v is not known, 1 is said from above and 0 from below. Of a normal start it
+    is the mean.
     """
+    found = [mean.bound(side) for mean in starts.means]
+    if len(starts.low):
+        found.append(_largest_of_sets(side, starts))
+    pick = max if side.above else min
+    return pick(rough for rough, _ in found), pick(bound for _, bound in found)
+
+
+def _largest_of_sets(side: Side, starts: Starts) -> tuple[float, float]:
     coefficients = side.values[-1]
     ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
     if not side.above:

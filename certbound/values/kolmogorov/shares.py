@@ -80,6 +80,7 @@ def _occupation(side: Side, starts: Array) -> Iterator[tuple[list[int], Array]]:
         gone += float(side.steps[k])
         if gone < longest * (1 - 1e-9) and k:
             continue
+        side.follow(k)
         there = equation.adjoint(longest, there)
         cells = there
         for i, (before, behind) in enumerate(side.carrier.pad):

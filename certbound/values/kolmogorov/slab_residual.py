@@ -16,11 +16,18 @@ noise replaced by their own interpolants (`cell_fields`), whose errors are paid 
            + sum_i C^i c h_i^(m+1) sup |d_i^(m+1) r_j|                                     (the interpolation's error),
 
 and d_i^(m+1) r_j is bounded term by term: d^(m+1) (F D) = sum_k binomial(m + 1, k) d^k F d^(m+1-k) D, d^(m+1) F = 0.
+
+Where L = sum_g c_g(t, d) L_g (`products`), each c_g is a polynomial of degree q in the share of the slab, but for an
+error (`factors`). Then r has degree 3 + q, with coefficients
+
+    r_k = (v_t)_k + sum_g sum_{i+j=k} binomial(q, i) binomial(3, j) / binomial(3 + q, k) c_gi L_g b_j,
+
+means of products, so that the same bounds of sizes serve; the errors of c_g are paid by the size of L_g v.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb
 from typing import Any
@@ -29,6 +36,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.values.kolmogorov.cell_fields import Field
+from certbound.values.kolmogorov.factors import Factor
 from certbound.values.kolmogorov.splines import (
     DEGREE,
     ROUNDOFF,
@@ -47,73 +55,81 @@ _UP = 1 + 1e-11
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Generator:
-    """L = f . D + tr(a D^2) / 2 on a grid: pairs of a derivative's orders and its coefficient.
+    """L = f . D + tr(a D^2) / 2 on a grid: derivatives' orders, their coefficients, and the products they belong to.
 
-    The coefficient of d_kl, k < l, is a_kl; of d_kk it is a_kk / 2 (``weights`` holds the half).
+    The coefficient of d_kl, k < l, is a_kl; of d_kk it is a_kk / 2 (the weight holds the half). ``products`` counts the
+    operators L_g with factors of time and disturbances of their own.
     """
 
     axes: tuple[Axis, ...]
-    terms: tuple[tuple[tuple[int, ...], Field, float], ...]
+    terms: tuple[tuple[tuple[int, ...], Field, float, int], ...]
+    products: int = 1
 
     @classmethod
-    def of(cls, axes: tuple[Axis, ...], drift: list[Field | None], square: list[Field | None]) -> Generator:
-        """From the outputs of the drift's tape and of that of a = g g' (row by row)."""
+    def of(cls, axes: tuple[Axis, ...], *products: tuple[list[Field | None], list[Field | None]]) -> Generator:
+        """From the outputs of the drift's tape and of that of a = g g' (row by row), product by product."""
         n = len(axes)
-        terms = [(unit(k, n), field, 1.0) for k, field in enumerate(drift) if field is not None]
-        for i in range(n):
-            for j in range(i, n):
-                field = square[i * n + j]
-                if field is not None:
-                    terms.append((plus(unit(i, n), unit(j, n)), field, 0.5 if i == j else 1.0))
-        return cls(axes=axes, terms=tuple(terms))
+        terms: list[tuple[tuple[int, ...], Field, float, int]] = []
+        for g, (drift, square) in enumerate(products):
+            terms += [(unit(k, n), field, 1.0, g) for k, field in enumerate(drift) if field is not None]
+            for i in range(n):
+                for j in range(i, n):
+                    field = square[i * n + j]
+                    if field is not None:
+                        terms.append((plus(unit(i, n), unit(j, n)), field, 0.5 if i == j else 1.0, g))
+        return cls(axes=axes, terms=tuple(terms), products=len(products))
 
-    def on_lattice(self, coefficients: Array) -> tuple[Array, Array]:
-        """v and L v at the lattice points."""
+    def on_lattice(self, coefficients: Array) -> tuple[Array, list[Array]]:
+        """v and every L_g v at the lattice points."""
         n = len(self.axes)
         parts: dict[tuple[int, ...], Array] = {(): coefficients}
-        wanted = {orders for orders, _, _ in self.terms} | {(0,) * n}
+        wanted = {orders for orders, *_ in self.terms} | {(0,) * n}
         for axis in range(n):
             new: dict[tuple[int, ...], Array] = {}
             for orders in {one[: axis + 1] for one in wanted}:
                 new[orders] = self.axes[axis].on_lattice[orders[-1]].along(parts[orders[:-1]], axis + 1)
             parts = new
-        total = np.zeros_like(parts[(0,) * n])
-        for orders, field, weight in self.terms:
+        totals = [np.zeros_like(parts[(0,) * n]) for _ in range(self.products)]
+        for orders, field, weight, g in self.terms:
             part = parts[orders] * field.lattice
-            total += part if weight == 1.0 else weight * part
-        return parts[(0,) * n], total
+            totals[g] += part if weight == 1.0 else weight * part
+        return parts[(0,) * n], totals
 
-    def remainder(self, sizes: Sizes, rates: Sizes) -> Array:
+    def remainder(self, sizes: Sizes, rates: Sizes, large: Sequence[Array | float], off: Sequence[Array]) -> Array:
         """Per cell: the interpolation's error of r_j, and what the coefficients' own errors cost.
 
-        ``sizes`` bounds the derivatives of every b_j, ``rates`` those of every (v_t)_j.
+        ``sizes`` bounds the derivatives of every b_j, ``rates`` those of every (v_t)_j; ``large`` and ``off`` bound
+        each factor and its error, slab by slab.
         """
         n = len(self.axes)
         total = np.zeros(())
-        for orders, field, weight in self.terms:
-            total = total + weight * field.error * sizes(orders)
+        for orders, field, weight, g in self.terms:
+            total = total + weight * large[g] * field.error * sizes(orders)
+            if off[g].any():
+                total = total + weight * off[g] * field.magnitude * sizes(orders)
         scale = 1.0
         for i, axis in enumerate(self.axes):
             degree = axis.sampling.parts
             width = axis.widths.reshape([-1 if k == i else 1 for k in range(n)])
             each = rates(unit(i, n, degree + 1))
-            for orders, field, weight in self.terms:
+            for orders, field, weight, g in self.terms:
                 for k in range(degree + 1):
                     higher = plus(orders, unit(i, n, degree + 1 - k))
                     if max(higher) <= DEGREE:
-                        each = each + weight * comb(degree + 1, k) * field.slopes[i][k] * sizes(higher)
+                        each = each + weight * large[g] * comb(degree + 1, k) * field.slopes[i][k] * sizes(higher)
             total = total + scale * axis.sampling.tail * width ** (degree + 1) * each
             scale *= axis.sampling.lebesgue
         return np.asarray(total)
 
-    def roundoff(self, sizes: Sizes, rates: Sizes, step: Array) -> Array:
+    def roundoff(self, sizes: Sizes, rates: Sizes, step: Array, large: Sequence[Array | float]) -> Array:
         """Per cell: what the rounding of r_j at its lattice points may come to."""
         zero = (0,) * len(self.axes)
         total = rates(zero) + 8 / step * sizes(zero)
-        for orders, field, weight in self.terms:
+        for orders, field, weight, g in self.terms:
             factors = [axis.condition[order] for axis, order in zip(self.axes, orders)]
-            total = total + weight * field.slopes[0][0] * outer(factors) * sizes(zero)
-        return np.asarray((1 + amplified(self.axes)) * ROUNDOFF * total)
+            total = total + weight * large[g] * field.slopes[0][0] * outer(factors) * sizes(zero)
+        more = 1 + 0.1 * self.products  # up to 20 roundings for each factor and sum
+        return np.asarray((1 + amplified(self.axes)) * more * ROUNDOFF * total)
 
 
 Part = tuple[Derivatives, "slice[Any, Any, Any]", Any]
@@ -136,7 +152,10 @@ class Sizes:
         return self.known[orders]
 
 
-def residual_bound(generator: Generator, values: Array, rates: Array, steps: Array) -> Array:
+def residual_bound(
+    generator: Generator, values: Array, rates: Array, steps: Array, factors: Sequence[Factor | None] = (None,),
+    *, worst: bool = True, clock: Array | None = None,
+) -> Array:  # fmt: skip
     """A bound of v_t + L v from above on every cell of every slab.
 
     Parameters
@@ -145,39 +164,92 @@ def residual_bound(generator: Generator, values: Array, rates: Array, steps: Arr
         Coefficients of v and v_t at the knots, from the last one backward.
     steps : ndarray, shape (K,)
         Lengths of the slabs in that order.
+    factors : sequence of Factor or None
+        Of each of the generator's products on these slabs; None for 1.
+    worst : bool
+        Whether the bound is one for all disturbances, or for the best of their nodes on each cell and slab.
+    clock : ndarray, shape (K,), optional
+        Share of each slab by which its length is off.
 
     Returns
     -------
     ndarray, shape (K, N_1, ...)
     """
     axes = generator.axes
-    h = steps.reshape(-1, *[1] * len(axes))
-    bound = np.full((len(steps), *(axis.cells for axis in axes)), -np.inf)
-    for residual in _in_time(generator, values, rates, h):
-        bound = np.maximum(bound, most_of_interpolants(axes, residual))
+    n = len(axes)
+    h = steps.reshape(-1, *[1] * n)
+    moved = _in_time(generator, values, rates, h, factors)
+    bounds = [np.maximum.reduce([most_of_interpolants(axes, r) for r in one]) for one in moved]
+    bound = np.maximum.reduce(bounds) if worst else np.minimum.reduce(bounds)
     sizes, speeds = _sizes(axes, values, rates, h)
-    extra = generator.remainder(sizes, speeds) + generator.roundoff(sizes, speeds, h)
+    large = [1.0 if one is None else one.size.reshape(h.shape) for one in factors]
+    off = [np.zeros(()) if one is None else (one.spread + worst * one.between).reshape(h.shape) for one in factors]
+    extra = generator.remainder(sizes, speeds, large, off) + generator.roundoff(sizes, speeds, h, large)
+    if clock is not None:
+        extra = extra + clock.reshape(h.shape) * speeds((0,) * n)
     return np.asarray(bound + extra * _UP)
 
 
-def rough_residual(generator: Generator, values: Array, rates: Array, steps: Array) -> Array:
+def rough_residual(
+    generator: Generator, values: Array, rates: Array, steps: Array, factors: Sequence[Factor | None] = (None,),
+    *, worst: bool = True,
+) -> Array:  # fmt: skip
     """About the same, from values at lattice points alone: nothing is proved of it."""
-    h = steps.reshape(-1, *[1] * len(generator.axes))
-    parts = [over_cells(generator.axes, residual) for residual in _in_time(generator, values, rates, h)]
-    return np.asarray(np.maximum.reduce(parts))
+    moved = _in_time(generator, values, rates, steps.reshape(-1, *[1] * len(generator.axes)), factors)
+    bounds = [np.maximum.reduce([over_cells(generator.axes, r) for r in one]) for one in moved]
+    return np.asarray(np.maximum.reduce(bounds) if worst else np.minimum.reduce(bounds))
 
 
-def _in_time(generator: Generator, values: Array, rates: Array, h: Array) -> Iterator[Array]:
-    """The Bernstein coefficients in time of v_t + L v, at the lattice points."""
-    value, image = generator.on_lattice(values)
-    rate, image_of_rate = generator.on_lattice(rates)
+def _in_time(
+    generator: Generator, values: Array, rates: Array, h: Array, factors: Sequence[Factor | None]
+) -> list[list[Array]]:  # fmt: skip
+    """The Bernstein coefficients in time of v_t + L v at the lattice points: for all disturbances, or for each node."""
+    n = len(generator.axes)
+    value, images = generator.on_lattice(values)
+    rate, images_of_rates = generator.on_lattice(rates)
     late, early = slice(None, -1), slice(1, None)
-    # m = 3 (b_2 - b_1) / h; the raised coefficients of v_t are D_k, (D_k + 2 m) / 3, (2 m + D_{k+1}) / 3, D_{k+1}
-    middle = 2 * (value[late] - value[early]) / h - (2 / 3) * (rate[early] + rate[late])
-    yield rate[early] + image[early]
-    yield rate[early] / 3 + middle + (image[early] + h / 3 * image_of_rate[early])
-    yield middle + rate[late] / 3 + (image[late] - h / 3 * image_of_rate[late])
-    yield rate[late] + image[late]
+    degree = 3 + max((0 if one is None else one.degree for one in factors), default=0)
+    moved = [_raised(_speeds(value, rate, h), degree)]
+    for factor, image, of_rate in zip(factors, images, images_of_rates):
+        parts = (
+            image[early], image[early] + h / 3 * of_rate[early], image[late] - h / 3 * of_rate[late], image[late],
+        )  # fmt: skip
+        if factor is None:
+            shares = [_raised(list(parts), degree)]
+        else:
+            rows = factor.bernstein.reshape(*factor.bernstein.shape, *[1] * n)
+            shares = [_product([row[:, i] for i in range(factor.degree + 1)], parts, degree) for row in rows]
+        if len(moved) < len(shares):
+            moved = moved * len(shares)
+        moved = [[a + b for a, b in zip(one, shares[v % len(shares)])] for v, one in enumerate(moved)]
+    return moved
+
+
+def _speeds(value: Array, rate: Array, h: Array) -> list[Array]:
+    """Bernstein coefficients of v_t, of degree 2, from the early end of each slab to its late one."""
+    late, early = slice(None, -1), slice(1, None)
+    return [rate[early], 3 * (value[late] - value[early]) / h - (rate[early] + rate[late]), rate[late]]
+
+
+def _raised(parts: list[Array], degree: int) -> list[Array]:
+    """Bernstein coefficients of the same polynomial as one of a higher degree."""
+    return _product([1.0] * (degree - len(parts) + 2), parts, degree)
+
+
+def _product(first: Sequence[Array | float], second: Sequence[Array], degree: int) -> list[Array]:
+    """Bernstein coefficients of a product of polynomials, raised to ``degree``."""
+    p, q = len(first) - 1, len(second) - 1
+    if p + q < degree:
+        return _raised(_product(first, second, p + q), degree)
+    result = []
+    for k in range(degree + 1):
+        total: Array | float = 0.0
+        for i in range(max(0, k - q), min(p, k) + 1):
+            share = comb(p, i) * comb(q, k - i) / comb(p + q, k)
+            one = second[k - i] if isinstance(first[i], float) and first[i] == 1.0 else first[i] * second[k - i]
+            total = total + (one if share == 1.0 else share * one)
+        result.append(np.asarray(total))
+    return result
 
 
 def _sizes(axes: tuple[Axis, ...], values: Array, rates: Array, h: Array) -> tuple[Sizes, Sizes]:

@@ -44,12 +44,16 @@ _GAMMAS = np.array([1.5858475867137631, -1.7098002380945074, 1.0515060232471816,
                     0.20098564717326586, -0.5027022888802305])  # fmt: skip
 _STAGE, _MIXED, _WEIGHTS, _SHARES = _method()
 
+SPLIT_METHOD = _STAGE, _MIXED, _WEIGHTS, np.array([float(_STAGE[i, :i] @ _SHARES[:i]) for i in range(4)])
+"""Stage and mixing matrices, weights and times of that method."""
+SPLIT_DIAGONAL = _DIAGONAL
+
 Stencils = Sequence[tuple[int, int]]
 DRIFT: Stencils = ((-2, 3), (-1, 2))
 """Upwind, where the drift is positive: of fifth order, of third where that does not fit or little noise smooths."""
 _PECLET = 10.0  # of drift times width to squared noise, beyond which differences of fifth order may grow
 NOISE: Stencils = ((-3, 3), (-2, 2))
-_CENTRAL: Stencils = ((-2, 2),)
+CENTRAL: Stencils = ((-2, 2),)
 
 Source = Callable[[float], Array | float]
 """Of the share of a step that has passed."""
@@ -132,7 +136,7 @@ class Equation:
                 total = total + _diagonal(spread[i, i] / 2) @ self._on(i, difference(nodes[i], NOISE, 2))
             for j in range(i):
                 if spread[i, j].any():
-                    cross = [self._on(k, difference(nodes[k], _CENTRAL, 1)) for k in (i, j)]
+                    cross = [self._on(k, difference(nodes[k], CENTRAL, 1)) for k in (i, j)]
                     total = total + _diagonal(spread[i, j]) @ cross[0] @ cross[1]
         self.matrix = (_diagonal(self.live.astype(float)) @ (total - _diagonal(rate))).tocsc()
         self.inverses: dict[float, sl.SuperLU] = {}
@@ -211,7 +215,7 @@ class SplitEquation:
             self.behind.append(np.ascontiguousarray(np.maximum(-f, 0) / behind + a / behind))
             for j in range(i):
                 if spread[i, j].any():
-                    first, second = (banded(difference(nodes[k], _CENTRAL, 1)) for k in (i, j))
+                    first, second = (banded(difference(nodes[k], CENTRAL, 1)) for k in (i, j))
                     self.mixed.append((i, j, first, second, spread[i, j] * self.live))
         self.terms = [term for term in self.terms if term[2].any()]
 

@@ -416,6 +416,29 @@ def most_on_cells(axes: tuple[Axis, ...], coefficients: Array) -> Array:
     return np.asarray(value + share * size)
 
 
+def most_of_difference(
+    axes: tuple[Axis, ...], others: tuple[Axis, ...], first: Array, second: Array, own: tuple[slice, ...],
+    places: tuple[slice, ...],
+) -> Array:  # fmt: skip
+    """An upper bound of the second spline less the first on cells that both have, ``own`` cells of the first's axes."""
+    parts, sizes = [], []
+    for grid, coefficients, cells in ((axes, first, own), (others, second, places)):
+        value, size = coefficients, np.abs(coefficients)
+        for k, axis in enumerate(grid):
+            value = axis.bernstein.along(value, k)
+            size = sliding_max(size, k, DEGREE + 1)
+        rows = tuple(slice((DEGREE + 1) * cell.start, (DEGREE + 1) * cell.stop) for cell in cells)
+        parts.append(value[rows])
+        share = np.full(cells_of(grid), 1e-11)
+        for k, axis in enumerate(grid):
+            share += _OFF * axis.moved.reshape([-1 if j == k else 1 for j in range(len(grid))])
+        sizes.append((share * size)[cells])
+    difference = np.ascontiguousarray(parts[1] - parts[0])
+    for k in range(len(axes)):
+        difference = sliding_max(difference, k, DEGREE + 1, DEGREE + 1)
+    return np.asarray(difference + sizes[0] + sizes[1])
+
+
 def over_cells(axes: tuple[Axis, ...], lattice: Array, skip: int | None = None) -> Array:
     """The largest of the lattice values on every cell; the tensor's last axes are those of the grid.
 

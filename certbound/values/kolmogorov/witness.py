@@ -17,7 +17,7 @@ from certbound.arrays import Array
 from certbound.values.kolmogorov.carry import Side
 from certbound.watch import poll
 
-_SOLVER = ("setting", "mesh", "carrier", "maps", "carried_maps", "sketch")
+_SOLVER = ("mesh", "carrier", "maps", "carried_maps", "sketch")
 _FINER = 2  # bits more, where rounded coefficients raise the bound by more than there is room for
 _MOST_BITS = 42  # of a whole number: five differences of such have 15 digits at most
 
@@ -96,7 +96,7 @@ class Witness:
     def _slope(self) -> float:
         """By how much the residual may move for a unit of the coefficients, largest over the cells."""
         total = np.zeros(())
-        for orders, field, weight in self.side.generator.terms:
+        for orders, field, weight, _ in self.side.generator.terms:
             size = weight * field.magnitude
             for axis, (one, order) in enumerate(zip(self.side.axes, orders)):
                 size = size / one.widths.reshape([-1 if k == axis else 1 for k in range(len(orders))]) ** order

@@ -124,7 +124,7 @@ def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(
     g = np.array([[0.5, 0.0], [0.2, 0.4]])
     a = g @ g.T
     drift = fields_of(name).on(axes, Interval.point(0.0))
-    generator = Generator.of(axes, drift, _constant_fields(axes, a))
+    generator = Generator.of(axes, (drift, _constant_fields(axes, a)))
     values, rates = rng.normal(size=(3, 12, 13)), rng.normal(size=(3, 12, 13))
     if steady:  # the drift's and the noise's own terms alone, where v does not change
         values, rates = np.broadcast_to(values[:1], values.shape).copy(), np.zeros_like(rates)
@@ -165,14 +165,9 @@ def test_a_model_that_is_undefined_on_a_cell_is_refused() -> None:
 def test_settings_that_are_not_served_are_refused_by_name() -> None:
     from certbound.errors import InfeasibleError
 
-    plain = {"states": ["x", "y"], "diffusion": np.eye(2)}
     stay = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
     cases = {
         "discrete": cb.DiscreteSystem(lambda x, y: [x / 2, y / 2], states=["x", "y"], noise=cb.Gaussian(std=0.1)),
-        "change with time": cb.ContinuousSystem(lambda t, x, y: [np.sin(t) - x, -y], **plain),
-        "a disturbance": cb.ContinuousSystem(
-            lambda x, d: [d[0] - x[0], -x[1]], disturbance=cb.Box([-0.1], [0.1]), **plain
-        ),
     }
     for words, system in cases.items():
         problem = cb.Problem(system, initial=[0, 0], safe=stay, horizon=1 if words != "discrete" else 5)
