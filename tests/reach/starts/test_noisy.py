@@ -66,6 +66,6 @@ def test_obstacles_and_curved_models_are_bounded_by_the_engine_of_each_cell() ->
     ball = cb.Outside(cb.Ball([5, 0], 0.6, coordinates=(0, 1)))
     problem = cb.Problem(still, initial=start, safe=[ball], horizon=8, delta=0.01)
     found = bound_noisy_start(problem, most=24, enough=never)
-    simulated = cb.simulate_exits(problem, paths=50_000)
+    simulated = cb.simulate_exits(problem, paths=10_000, steps=200)
     assert found.lower <= simulated.upper
     assert simulated.lower <= found.upper < 0.75  # the mean meets the ball, and without cells nothing below 1 is proved
