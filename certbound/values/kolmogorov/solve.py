@@ -43,9 +43,6 @@ _GAMMAS = np.array([1.5858475867137631, -1.7098002380945074, 1.0515060232471816,
                     0.20098564717326586, -0.5027022888802305])  # fmt: skip
 _STAGE, _MIXED, _WEIGHTS, _SHARES = _method()
 
-_ON_DIAGONAL = {"SymmetricMode": True}
-"""Stencils are nearly symmetric and their diagonal is large: pivots there keep the factors a quarter smaller."""
-
 Stencils = Sequence[tuple[int, int]]
 DRIFT: Stencils = ((-2, 3), (-1, 2))
 """Upwind, where the drift is positive: of fifth order, of third where that does not fit or no noise smooths."""
@@ -148,7 +145,8 @@ class Equation:
         if key not in self.inverses:
             size = self.matrix.shape[0]
             matrix = (sp.identity(size) - key * self.matrix).tocsc()
-            self.inverses[key] = sl.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_ON_DIAGONAL)
+            ways = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+            self.inverses[key] = sl.splu(matrix, **ways)  # stencils are nearly symmetric, their diagonal is large
         return self.inverses[key].solve(values.ravel()).reshape(self.shape)
 
     def step(self, values: Array, step: float, source: Source, given: Source) -> Array:
