@@ -57,7 +57,7 @@ def test_two_independent_states_fail_as_often_as_the_bounds_say() -> None:
 def test_noise_in_the_velocity_alone_is_bounded_from_both_sides() -> None:
     problem = oscillator()
     found = last(problem, seconds=40.0)
-    seen = cb.simulate_exits(problem, paths=20000, rng=np.random.default_rng(0), confidence=1 - 1e-6)
+    seen = cb.simulate_exits(problem, paths=20000, rng=np.random.default_rng(0), confidence=1 - 1e-6, halve=False)
     assert found.lower <= seen.upper
     assert found.upper >= seen.lower
     assert 0 < found.lower < found.upper < 1
