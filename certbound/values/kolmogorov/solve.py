@@ -145,8 +145,9 @@ class Equation:
         if key not in self.inverses:
             size = self.matrix.shape[0]
             matrix = (sp.identity(size) - key * self.matrix).tocsc()
-            ways = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-            self.inverses[key] = sl.splu(matrix, **ways)  # stencils are nearly symmetric, their diagonal is large
+            self.inverses[key] = sl.splu(  # stencils are nearly symmetric, and the diagonal is large
+                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
         return self.inverses[key].solve(values.ravel()).reshape(self.shape)
 
     def step(self, values: Array, step: float, source: Source, given: Source) -> Array:

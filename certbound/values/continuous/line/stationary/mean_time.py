@@ -224,15 +224,9 @@ class _Mean:
         steps = Interval.point(self.nodes[1:]) - Interval.point(self.nodes[:-1])
         simpson = Interval.point(self.at_nodes[:-1]) + Interval.point(self.at_nodes[1:])
         parts = steps * (simpson + Interval.point(4.0) * Interval.point(self.at_middles)) / Interval.point(6.0)
-        low, high = parts.lo, parts.hi
-        if self.free[0]:
-            low, high = -parts.hi[::-1], -parts.lo[::-1]
-        ends = (
-            np.array(list(accumulate(rows.tolist(), lambda a, b, to=to: math.nextafter(a + b, to), initial=0.0)))
-            for rows, to in ((low, -math.inf), (high, math.inf))
-        )
-        low, high = (row[::-1] if self.free[0] else row for row in ends)
-        return Interval(low, high)
+        low, high = (-parts.hi[::-1], -parts.lo[::-1]) if self.free[0] else (parts.lo, parts.hi)
+        low, high = _sums(low, -math.inf), _sums(high, math.inf)
+        return Interval(low[::-1], high[::-1]) if self.free[0] else Interval(low, high)
 
     @property
     def upper(self) -> float:
@@ -274,6 +268,11 @@ class _Mean:
         slopes = _quadratic(self.at_nodes, self.at_middles)[first:last]
         between = points[:-1] + steps * slopes
         return Interval(np.minimum(between.lo, points.lo[1:]), np.maximum(between.hi, points.hi[1:]))
+
+
+def _sums(parts: Array, to: float) -> Array:
+    """0 and the sums of the first parts, each of them rounded towards ``to``."""
+    return np.array(list(accumulate(parts.tolist(), lambda a, b: math.nextafter(a + b, to), initial=0.0)))
 
 
 def _quadratic(at_nodes: Array, at_middles: Array) -> Interval:
