@@ -98,7 +98,7 @@ class Interval:
     def mid(self) -> Array:
         """A finite number in each interval, the midpoint up to rounding; see `rad`."""
         lo, hi = np.maximum(self.lo, -LARGEST), np.minimum(self.hi, LARGEST)
-        result: Array = np.clip(0.5 * lo + 0.5 * hi, lo, hi)
+        result: Array = np.minimum(np.maximum(0.5 * lo + 0.5 * hi, lo), hi)
         infinite = ~(np.isfinite(self.lo) & np.isfinite(self.hi))
         if np.count_nonzero(infinite):
             result = np.where(infinite, np.clip(0.0, lo, hi), result)

@@ -46,13 +46,13 @@ def lower(value: Array, *, step: float | Array = _STEP, tiny: float = 0.0) -> Ar
     exceeds half a unit in the last place also where it is subnormal; sums underflow exactly, so that 0 stays
     0 unless ``tiny`` asks for more. A result of +inf is an overflow and gives the largest float.
     """
-    value = np.minimum(value, _MOST)
+    value = np.minimum(value, _MOST)  # an array of its own from here on
     slack = np.abs(value)
     slack *= step
     if tiny:
         slack += tiny
-    result: Array = value - slack
-    return result
+    value -= slack
+    return value
 
 
 def upper(value: Array, *, step: float | Array = _STEP, tiny: float = 0.0) -> Array:
@@ -62,8 +62,8 @@ def upper(value: Array, *, step: float | Array = _STEP, tiny: float = 0.0) -> Ar
     slack *= step
     if tiny:
         slack += tiny
-    result: Array = value + slack
-    return result
+    value += slack
+    return value
 
 
 def product_error(terms: int) -> tuple[float, float]:

@@ -61,7 +61,7 @@ def course(start: Any = Diamond([0.3, -0.2], 0.05), **options: Any) -> cb.Proble
 @cache
 def counted() -> cb.ExitCounts:
     """Paths of the course that leave."""
-    return cb.simulate_exits(course(), paths=20_000, rng=np.random.default_rng(0))
+    return cb.simulate_exits(course(), paths=20_000, rng=np.random.default_rng(0), halve=False)
 
 
 @cache
@@ -116,7 +116,7 @@ def test_it_is_proved_in_continuous_time_too(monkeypatch: pytest.MonkeyPatch) ->
         flow, initial=Diamond([0.1, 0.0], 0.05), safe=safe, horizon=0.5, delta=0.2,
         domain=cb.Box([-1.1, -1.1], [1.1, 1.1]),  # for the barrier, which asks for a box
     )  # fmt: skip
-    low = cb.simulate_exits(problem, paths=10_000, steps=200, rng=np.random.default_rng(0)).lower
+    low = cb.simulate_exits(problem, paths=10_000, steps=200, rng=np.random.default_rng(0), halve=False).lower
     for method in ("constants", "linear", "barrier"):
         verdict = cb.verify_safety(problem, method=method)
         assert low <= 10**verdict.log10_delta < 1, method

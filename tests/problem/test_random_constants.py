@@ -92,12 +92,12 @@ def test_files_state_what_is_drawn(gain, tmp_path):
 def test_the_average_holds_against_simulation_from_both_sides_where_values_are_single():
     problem = given(MODES).replace(delta=0.02)
     verdict = cb.verify_safety(problem, method="values")
-    found = cb.simulate_exits(problem, paths=100_000, rng=2)
+    found = cb.simulate_exits(problem, paths=100_000, rng=2, halve=False)
     assert verdict.status == "UNSAFE"
     assert 10**verdict.log10_lower <= found.upper
     assert found.lower <= 10**verdict.log10_delta
     assert 10 ** (verdict.log10_delta - verdict.log10_lower) < 1.04
-    alone = cb.simulate_exits(problem, paths=50_000, rng=3, scenario=Scenario(disturbance=[0.9]))
+    alone = cb.simulate_exits(problem, paths=50_000, rng=3, scenario=Scenario(disturbance=[0.9]), halve=False)
     assert alone.probability > 1.5 * found.probability
 
 
@@ -122,7 +122,7 @@ def test_lower_bounds_of_values_are_not_added_where_each_has_another_worst_start
 def test_the_average_is_better_than_the_worst_value_and_never_below_simulation():
     problem = given(UNIFORM).replace(delta=0.022)
     verdict = cb.verify_safety(problem, method="values")
-    found = cb.simulate_exits(problem, paths=100_000, rng=4)
+    found = cb.simulate_exits(problem, paths=100_000, rng=4, halve=False)
     unknown = cb.verify_safety(problem.replace(random=None, unknown=["gain"]), method="values")
     assert found.lower < 10**verdict.log10_delta < 10**unknown.log10_delta
     assert verdict.status == "SAFE"

@@ -36,7 +36,7 @@ def test_a_state_without_bounds_gets_sides_that_are_paid_for() -> None:
     assert not np.isfinite(safe_sides(problem)[0][1])
     assert labels(problem) == ["p below", "p above", "v below", "v above"]
     found = bound_quadratic(problem, target=1.0, seconds=60.0)
-    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(0))
+    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(0), halve=False)
     assert seen.lower <= 10**found.upper < 0.5
 
 
@@ -73,7 +73,7 @@ def test_half_spaces_balls_and_obstacles_are_walls() -> None:
     assert len([name for name in labels(problem) if "inside" in name or "<=" in name]) == 3
     assert "outside" in labels(problem)[2]
     found = bound_quadratic(problem, target=1.0, seconds=60.0)
-    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(0))
+    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(0), halve=False)
     assert seen.lower <= 10**found.upper < 1
 
 
@@ -83,7 +83,7 @@ def test_disturbances_are_covered() -> None:
     problem = of([cb.Inside(cb.Box([-0.6, -1.0], [0.6, 1.0]))], system=pushed)
     found = bound_quadratic(problem, target=1.0, seconds=60.0)
     worst = cb.ContinuousSystem(lambda x: [x[1], -x[0] - x[1] + 0.4], states=2, diffusion=[[0.05], [0.3]])
-    seen = cb.simulate_exits(problem.replace(system=worst), paths=4000, rng=np.random.default_rng(0))
+    seen = cb.simulate_exits(problem.replace(system=worst), paths=4000, rng=np.random.default_rng(0), halve=False)
     assert seen.lower <= 10**found.upper < 1
     assert 10**found.upper > 10 ** bound_quadratic(of(problem.safe), target=1.0, seconds=60.0).upper
 

@@ -45,7 +45,7 @@ def random_problem(seed: int) -> cb.Problem:
 def test_the_bound_is_above_the_frequency_of_failures(seed: int) -> None:
     problem = random_problem(seed)
     found = bound_quadratic(problem, target=1.0, seconds=60.0)  # one pass over the walls
-    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(seed))
+    seen = cb.simulate_exits(problem, paths=4000, rng=np.random.default_rng(seed), halve=False)
     assert seen.lower <= 10**found.upper < 1
 
 
@@ -53,7 +53,7 @@ def test_cells_that_are_curved_at_some_times_only_have_the_same_corners() -> Non
     """Drift and noise of this one change with time: on some pieces a remainder is 0."""
     problem = quadratic(np.random.default_rng([7, 13]))
     found = bound_quadratic(problem, target=1e-6, seconds=0.5)  # a pass over the walls, and some of the search
-    seen = cb.simulate_exits(problem, paths=1000, rng=np.random.default_rng(1))
+    seen = cb.simulate_exits(problem, paths=1000, rng=np.random.default_rng(1), halve=False)
     assert seen.lower <= 10**found.upper <= 1
 
 
@@ -90,7 +90,7 @@ class Known:
         self.stated, self.times = stated, times
         one = cb.Problem(cb.ContinuousSystem(lambda x: -x, states=1, diffusion=0.6), initial=[0], horizon=1.0,
                          safe=[cb.Inside(cb.Box([-1], [1]))])  # fmt: skip
-        seen = cb.simulate_exits(one, paths=20_000, rng=np.random.default_rng(1))
+        seen = cb.simulate_exits(one, paths=20_000, rng=np.random.default_rng(1), halve=False)
         self.truth = float(np.log(seen.lower / 2))  # of leaving through one of two sides
 
     def level(self, proposal: Proposal) -> float:

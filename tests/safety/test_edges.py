@@ -342,7 +342,7 @@ def check_engine(problem: cb.Problem, row: Row, engine: str) -> bool:
 def check_simulation(problem: cb.Problem, row: Row) -> None:
     if row.steps == 0:
         return
-    found = cb.simulate_exits(problem, paths=PATHS, rng=np.random.default_rng(5), steps=row.steps)
+    found = cb.simulate_exits(problem, paths=PATHS, rng=np.random.default_rng(5), steps=row.steps, halve=False)
     assert binom.sf(found.exits - 1, PATHS, row.most) >= CONFIDENCE, f"{row.name}: {found.exits} exits"
     assert binom.cdf(found.exits, PATHS, row.least) >= CONFIDENCE, f"{row.name}: {found.exits} exits"
 
@@ -380,11 +380,13 @@ def one_of_each_kind() -> Iterator[Row]:
 
 
 def test_no_engine_is_wrong_about_a_path_that_ends_on_an_edge() -> None:
-    check_rows(one_of_each_kind(), {"values", "linear"})
+    among = tuple(name for name in ENGINES if name != "quadratic")  # it has a test of its own, of starts on an edge
+    check_rows(one_of_each_kind(), {"values", "linear"}, among=among)
 
 
 GROUPS: dict[str, tuple[Callable[[], Iterator[Row]], set[str]]] = {
-    **{law: (lambda law=law: coin_rows([law]), {"values", "linear"}) for law in COINS},  # type: ignore[misc]
+    **{law: (lambda law=law: coin_rows([law]), {"linear", "quadratic" if law == "bounded" else "values"})  # type: ignore[misc]
+       for law in COINS},  # the value functions serve no law of which its limits alone are known
     "densities": (null_rows, {"values"}),
     "corners": (corner_rows, {"values", "linear", "constants", "quadratic"}),
     "targets": (target_rows, {"values"}),

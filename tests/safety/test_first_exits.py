@@ -344,17 +344,14 @@ def test_a_mean_that_was_proved_in_time_stands_without_curves(monkeypatch):
     assert found.at(2.0) == (0.0, 1.0)
 
 
-def test_the_command_has_a_limit_of_its_own(monkeypatch, capsys):
+def test_the_command_has_a_limit_of_its_own(found, monkeypatch, capsys):
     limits = []
 
     def asked(problem):
         limits.append(current_watch().limit)
-        return exit_times(problem)
+        return found
 
-    exit_times = first_exits.bound_exit_times
     monkeypatch.setattr(first_exits, "bound_exit_times", asked)
-    monkeypatch.setattr(first_exits, "_STEP", 0.05)
-    monkeypatch.setattr(first_exits, "_SHORTEST", 1)
     for words in ((), ("--time-limit", "7")):
         assert run(["exit-times", "ou", "--set", "radius=1", "--json", *words]) == 0
     assert all(most - 5 < limit <= most for limit, most in zip(limits, (60, 7), strict=True))  # since the command began

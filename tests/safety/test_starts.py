@@ -77,7 +77,8 @@ def test_from_every_safe_start_simulation_fails_no_more_often_than_delta(make: M
     worst = np.argsort(found.bound(inner))[-1:]
     for point in [*inner[worst], low[0], high[-1]]:  # the rim, where the bound is all but used up
         assert found.contains(point)
-        counts = cb.simulate_exits(problem.replace(initial=point), paths=10_000, rng=rng, confidence=0.998)
+        asked = problem.replace(initial=point)
+        counts = cb.simulate_exits(asked, paths=10_000, rng=rng, confidence=0.998, halve=False)
         assert counts.lower <= 10.0 ** float(found.bound(point)[0]) <= problem.delta * (1 + 1e-12)
         if found.charts.lower and problem.system.disturbance is None:  # it bounds the worst disturbance
             assert counts.upper >= 10.0 ** float(found.charts.lower[0].at(point[None], up=False)[0])
@@ -89,7 +90,8 @@ def test_the_bounds_lie_close_above_and_below_the_truth() -> None:
     assert [chart.time for chart in charts.upper] == [0.0, 5.0, 10.0, 15.0]
     rng = np.random.default_rng(5)
     for point in ([0.42], [0.5], [0.8]):
-        counts = cb.simulate_exits(problem.replace(initial=point), paths=200_000, rng=rng, confidence=0.998)
+        asked = problem.replace(initial=point)
+        counts = cb.simulate_exits(asked, paths=200_000, rng=rng, confidence=0.998, halve=False)
         above, below = charts.upper[0].at(np.array([point]), up=True), charts.lower[0].at(np.array([point]), up=False)
         assert counts.lower <= 10.0 ** above[0] <= 1.15 * counts.upper
         assert counts.upper >= 10.0 ** below[0] >= counts.lower / 1.15

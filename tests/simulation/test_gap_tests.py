@@ -22,7 +22,7 @@ def brownian(n=1, drift=0.0, gain=None):
 def exits(system, safe, *, start=None, steps=16, horizon=1.0, rng=1, scenario=None, **options):
     start = np.zeros(system.dimension) if start is None else start
     subject = cb.Problem(system, initial=start, safe=safe, horizon=horizon, **options)
-    return simulate_exits(subject, paths=PATHS, rng=rng, steps=steps, scenario=scenario)
+    return simulate_exits(subject, paths=PATHS, rng=rng, steps=steps, scenario=scenario, halve=False)
 
 
 def agrees(result, probability, bias=0.0):
@@ -185,7 +185,7 @@ def test_a_direction_without_noise_is_not_bridged():
 def test_discrete_time_counts_steps_only():
     system = cb.DiscreteSystem(lambda x: 0.0 * x, states=1, noise=cb.Gaussian(std=1.0))
     subject = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.HalfSpace([1.0], 1.0), during=(2, 3))], horizon=4)
-    result = simulate_exits(subject, paths=PATHS, rng=1)
+    result = simulate_exits(subject, paths=PATHS, rng=1, halve=False)
     assert agrees(result, 1 - ndtr(1.0) ** 2)
     by_step = result.exits_by_time[0]
     assert by_step[[0, 1, 4]].tolist() == [0, 0, 0]
@@ -218,7 +218,7 @@ def test_a_path_that_passes_an_obstacle_without_width_between_two_steps_has_fail
     system = cb.ContinuousSystem(lambda x: [1 + 0 * x[0], -x[1]], states=2, diffusion=np.array([[0.0], [0.1]]))
     for region, share in ((cb.Box([0.3], [0.3], coordinates=[0]), 1.0), (cb.Box([1.5], [1.5], coordinates=[0]), 0.0)):
         subject = cb.Problem(system, initial=[0.0, 0.0], safe=[cb.Outside(region)], horizon=1.0)
-        assert simulate_exits(subject, paths=100, rng=1, steps=4).probability == share
+        assert simulate_exits(subject, paths=100, rng=1, steps=4, halve=False).probability == share
 
 
 @pytest.mark.parametrize(("limit", "leaves"), [(0.999, True), (1.001, False)])
@@ -232,11 +232,11 @@ def test_a_position_is_seen_where_it_turns_between_two_steps(limit, leaves, shap
         "half-space": cb.Outside(cb.HalfSpace([-1.0, 0.0], -limit)),
     }[shape]
     subject = cb.Problem(system, initial=[0.0, 1.0], safe=[safe], horizon=3.0)
-    found = simulate_exits(subject, paths=4, rng=1, steps=10)
+    found = simulate_exits(subject, paths=4, rng=1, steps=10, halve=False)
     assert found.exits == (4 if leaves else 0)
     rare = simulate_rare_exits(subject, paths=200, particles=20, rng=1, steps=10)
     assert rare.probability == pytest.approx(1.0 if leaves else 0.0)
-    bare = simulate_exits(subject, paths=4, rng=1, steps=10, scenario=Scenario(bridge=False))
+    bare = simulate_exits(subject, paths=4, rng=1, steps=10, scenario=Scenario(bridge=False), halve=False)
     assert bare.exits == 0
 
 
@@ -245,4 +245,4 @@ def test_a_position_is_not_looked_for_outside_of_a_window():
     box = cb.Box([-2.0, -np.inf], [0.999, np.inf])
     for during, exits in (((0.0, 1.5), 0), ((1.8, 3.0), 0), ((1.2, 1.8), 4)):
         subject = cb.Problem(system, initial=[0.0, 1.0], safe=[cb.Inside(box, during=during)], horizon=3.0)
-        assert simulate_exits(subject, paths=4, rng=1, steps=10).exits == exits
+        assert simulate_exits(subject, paths=4, rng=1, steps=10, halve=False).exits == exits

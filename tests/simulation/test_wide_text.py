@@ -57,7 +57,7 @@ def test_kernels_with_arrays_and_with_variables_give_the_same_paths_and_counts(m
     for wide in (True, False):
         monkeypatch.setattr(writer, "fits", lambda tape, dimension, wide=wide: wide)
         paths = sample_paths(problem, paths=20, rng=3, steps=50, deviation=True)
-        exits = simulate_exits(problem, paths=2000, rng=3, steps=50)
+        exits = simulate_exits(problem, paths=2000, rng=3, steps=50, halve=False)
         rare = simulate_rare_exits(problem, paths=200, particles=20, rng=3, steps=50)
         found.append((paths, exits.exits_by_time, rare.probability))
     np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-10, atol=1e-12)

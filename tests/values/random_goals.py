@@ -80,7 +80,7 @@ def check(kind: str, seed: int, seconds: float, paths: int = 100_000) -> str:
     found = bounds(problem, seconds)
     spent = time.process_time() - begin
     upper, lower = 10**found.upper, 0.0 if found.lower is None else 10**found.lower
-    counts = cb.simulate_exits(problem, paths=paths, rng=seed, confidence=0.9999)
+    counts = cb.simulate_exits(problem, paths=paths, rng=seed, confidence=0.9999, halve=False)
     bad = upper < counts.lower - GRANTED * counts.probability
     if problem.initial.is_point:
         bad |= lower > counts.upper + GRANTED * counts.probability

@@ -33,7 +33,7 @@ _GRANT = 0.7  # of the time that is left, where all of it may be spent: what doe
 _LEAST = 1e-3
 _FLOOR = -300.0
 _BACKWARD = 20.0  # of work, where it is asked alone
-_BRIEF = 0.75  # of that, where it is asked among others
+_BRIEF = 0.4  # of that, where it is asked among others: for all of it, from the beginning, once they prove nothing
 _RATIO, _RATIO_WITH_EFFORT = 1.05, 1.0001  # of the two bounds below which grids are not refined
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -180,7 +181,7 @@ def stages_of(problem: Problem) -> list[Setting]:
     pace = max(1.0, 1 / (_USUAL_STEPS * pace_of(factors, horizon, middle))) if timed else 1.0
     read = [*sources(problem.closed_loop), *sources(square)]
     start_low, start_high = (np.array(rows) for rows in zip(*(_around(start) for start in problem.starts)))
-    flow, spread = _in_floats(problem.closed_loop, n, middle), _in_floats(square, n)
+    flow, spread = _InFloats(problem.closed_loop, middle), _InFloats(square)
     lows, highs = (np.array([room[side] for room in rooms]) for side in (0, 1))  # (stages, rows, n)
     limited = np.stack([np.isfinite(lows[:, 0]), np.isfinite(highs[:, 0])], axis=1)
     hit = None if opens else target
@@ -311,17 +312,23 @@ def _nothing(tape: Tape, n: int) -> Tape:
     return graph.tape([graph.const(0.0)] * len(tape.outputs), (len(tape.outputs),))
 
 
-def _in_floats(tape: Tape, n: int, usual: Array | None = None) -> Flow:
+class _InFloats:
     """A tape as a function of points, a time, and disturbances, which are ``usual`` ones where none are given."""
-    function = compile_numpy(tape)
-    count = len(tape.outputs)
 
-    def call(points: Array, time: float = 0.0, disturbance: Array | None = usual) -> Array:
-        rest = () if disturbance is None else tuple(disturbance)
-        values = function(time, *points, *rest)
-        return np.ascontiguousarray(np.moveaxis(values.reshape(*points.shape[1:], count), -1, 0))
+    def __init__(self, tape: Tape, usual: Array | None = None) -> None:
+        self.tape, self.usual = tape, usual
 
-    return call
+    @cached_property
+    def function(self) -> Callable[..., Array]:
+        return compile_numpy(self.tape)
+
+    def __reduce__(self) -> tuple[type, tuple[Tape, Array | None]]:
+        return _InFloats, (self.tape, self.usual)
+
+    def __call__(self, points: Array, time: float = 0.0, disturbance: Array | None = None) -> Array:
+        acting = self.usual if disturbance is None else disturbance
+        values = self.function(time, *points, *(() if acting is None else tuple(acting)))
+        return np.ascontiguousarray(np.moveaxis(values.reshape(*points.shape[1:], len(self.tape.outputs)), -1, 0))
 
 
 def _visited(
@@ -337,7 +344,7 @@ def _visited(
     assert isinstance(system, ContinuousSystem)
     g = system.diffusion
     columns = g.shape[1]
-    noise = _in_floats(g, n) if isinstance(g, Tape) else lambda x, t: np.asarray(g).reshape(n * columns, 1)
+    noise = _InFloats(g) if isinstance(g, Tape) else lambda x, t: np.asarray(g).reshape(n * columns, 1)
     extreme = disturbance[rng.integers(2, size=(len(disturbance.T), _PATHS)), np.arange(len(disturbance.T))[:, None]]
     which = rng.integers(len(low), size=_PATHS)
     x = low[which].T + (high - low)[which].T * rng.random((n, _PATHS))

@@ -164,7 +164,10 @@ class Equation:
         key = float(np.format_float_positional(share, precision=9, unique=False, fractional=False))
         if key not in self.inverses:
             size = self.matrix.shape[0]
-            self.inverses[key] = sl.splu((sp.identity(size) - key * self.matrix).tocsc(), permc_spec="COLAMD")
+            matrix = (sp.identity(size) - key * self.matrix).tocsc()
+            self.inverses[key] = sl.splu(  # stencils are nearly symmetric, and the diagonal is large
+                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
         return self.inverses[key]
 
     def step(self, values: Array, step: float, source: Source, given: Source) -> Array:

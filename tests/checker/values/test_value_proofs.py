@@ -273,7 +273,7 @@ def test_the_two_bounds_of_a_probability_enclose_a_simulation(make: Any) -> None
     assert least.log10_delta == 0.0
     assert "some" in least.claim or "normal start" in least.claim
     if problem.system.disturbance is None:
-        found = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(4), confidence=0.999)
+        found = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(4), confidence=0.999, halve=False)
         assert 10**least.log10_lower_proved <= found.upper
         assert found.lower <= 10**most.log10_proved
 
@@ -290,7 +290,7 @@ def test_a_lower_bound_in_the_plane_is_proved_again() -> None:
     verdict = SimpleNamespace(status="UNSAFE", reason="", answers={"values": answer})
     report = check_data(parse(certificate_text(problem, verdict)), problem_data(problem))
     assert report.valid
-    seen = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0))
+    seen = cb.simulate_exits(problem, paths=20_000, rng=np.random.default_rng(0), halve=False)
     assert report.log10_lower_proved is not None
     assert found.lower - 0.3 < report.log10_lower_proved <= math.log10(seen.upper)
 

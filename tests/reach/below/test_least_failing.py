@@ -118,7 +118,7 @@ def curved(safe, horizon=2.0, sigma=0.6, start=(0.0, 0.0), delta=0.01, **options
 
 
 def exits(problem, paths=2000):
-    found = cb.simulate_exits(problem, paths=paths, rng=np.random.default_rng(0))
+    found = cb.simulate_exits(problem, paths=paths, rng=np.random.default_rng(0), halve=False)
     return found.exits / paths
 
 

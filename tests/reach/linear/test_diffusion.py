@@ -68,7 +68,7 @@ def level(problem: cb.Problem, nonlinear: Share) -> float:
 @pytest.mark.parametrize("paths", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_simulation_does_not_contradict_the_bound(build: Callable[[], cb.Problem], steps: int, paths: int) -> None:
     problem = build()
-    found = cb.simulate_exits(problem, paths=paths, rng=np.random.default_rng(1), steps=steps)
+    found = cb.simulate_exits(problem, paths=paths, rng=np.random.default_rng(1), steps=steps, halve=False)
     bound = 10 ** level(problem, Share.of(problem.delta / 10))
     assert found.exits > 0  # the simulation can tell
     assert found.lower <= bound < 0.3
@@ -77,7 +77,7 @@ def test_simulation_does_not_contradict_the_bound(build: Callable[[], cb.Problem
 def test_noise_frozen_on_the_nominal_would_be_unsound_and_is_not_what_is_proved() -> None:
     problem = free(0.4)
     frozen = problem.replace(system=cb.ContinuousSystem(lambda t, x: [0 * x[0]], states=1, diffusion=[[0.1]]))
-    found = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(2), steps=200)
+    found = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(2), steps=200, halve=False)
     assert 10 ** level(frozen, Share.of(1e-3)) < found.lower  # the formula without M
     assert found.lower <= 10 ** level(problem, Share.of(1e-3)) < 0.3
 
@@ -160,5 +160,5 @@ def test_noise_that_jumps_on_the_tube_is_not_taken_for_constant() -> None:
 def test_a_diffusion_of_time_alone_is_bounded_as_well() -> None:
     system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=lambda t, x: [[0.1 + 0.05 * np.sin(t)]])
     problem = growing().replace(system=system)
-    found = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(4), steps=200)
+    found = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(4), steps=200, halve=False)
     assert found.lower <= 10 ** level(problem, Share.of(1e-3)) < 0.1

@@ -47,7 +47,7 @@ def values(barrier: Barrier, x: np.ndarray) -> np.ndarray:
 
 def test_the_bound_is_above_the_probability_and_not_far_above() -> None:
     found = barrier_engine(scalar())
-    exits = cb.simulate_exits(scalar(), paths=200_000, rng=1, steps=400)
+    exits = cb.simulate_exits(scalar(), paths=200_000, rng=1, steps=400, halve=False)
     assert 10**found.log10_delta >= exits.probability
     stationary = 2 * norm.sf(1 / (0.3 / np.sqrt(2)))
     assert 10**found.log10_delta < 100 * stationary
@@ -90,7 +90,7 @@ def test_noise_that_depends_on_the_state_a_disturbance_and_an_obstacle(monkeypat
         safe=[cb.Inside(cb.Box([-1, -1], [1, 1])), cb.Outside(cb.Ball([0.7, 0.7], 0.2))],
     )  # fmt: skip
     found = barrier_engine(problem)
-    exits = cb.simulate_exits(problem, paths=20_000, rng=1, steps=200)
+    exits = cb.simulate_exits(problem, paths=20_000, rng=1, steps=200, halve=False)
     assert found.log10_delta < -1.5
     assert 10**found.log10_delta >= exits.lower
 

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import certbound as cb
+import certbound.values.kolmogorov as kolmogorov
 from certbound.checker import check_data, parse
 from certbound.problem.problem import Problem
-from certbound.safety.answers import Request
+from certbound.safety.answers import EngineAnswer, Request
+from certbound.safety.engines import values
 from certbound.safety.engines.values import log10_outward, values_engine
+from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
+from certbound.values.kolmogorov.door import Bounds
 
 
 def logistic(**changes: object) -> Problem:
@@ -79,3 +85,25 @@ def test_a_window_that_bounds_no_state_beyond_it_is_served() -> None:
     answer = values_engine(Problem(system, initial=[0.3], safe=[within], horizon=3))
     assert answer.applicable
     assert answer.log10_delta < -10
+
+
+def test_the_backward_equation_is_solved_briefly_first_and_in_full_once_nothing_else_is_proved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Grids begin from the coarsest again, so that what is done before the others' turns is done twice."""
+    asked: list[float] = []
+
+    def bound_failing(problem: Problem, *, seconds: float, delta: float) -> Iterator[Bounds]:
+        asked.append(seconds)
+        yield Bounds(lower=0.0, upper=0.5, cells=(9, 9), steps=9, runs=1, estimate=0.2, work=1.0)
+
+    monkeypatch.setattr(kolmogorov, "bound_failing", bound_failing)
+    nothing = EngineAnswer(applicable=False, reason="nothing")
+    for name, row in ENGINES.items():
+        if name != "backward":
+            monkeypatch.setitem(ENGINES, name, replace(row, prove=lambda *given: nothing, below=None))
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0]], states=2, diffusion=[[0.0], [0.5]])
+    safe = [cb.Inside(cb.Box([-1, -3], [1, 3]))]
+    assert verify_safety(Problem(system, initial=[0, 0], safe=safe, horizon=4.0, delta=0.1)).status == "UNKNOWN"
+    assert asked[-1] == values._BACKWARD
+    assert sum(asked) <= 1.3 * values._BACKWARD

@@ -28,7 +28,7 @@ def test_paths_keep_their_inputs_between_sampling_times() -> None:
 
 
 def test_counts_agree_with_a_loop_of_ones_own() -> None:
-    found = cb.simulate_exits(loud(1.0), paths=20_000, rng=1, steps=800)
+    found = cb.simulate_exits(loud(1.0), paths=20_000, rng=1, steps=800, halve=False)
     rng, h = np.random.default_rng(2), 4 / 800
     x, u, left = np.ones(20_000), np.zeros(20_000), np.zeros(20_000, dtype=bool)
     for k in range(800):
@@ -39,7 +39,7 @@ def test_counts_agree_with_a_loop_of_ones_own() -> None:
 
 
 def test_the_steps_end_at_sampling_times() -> None:
-    assert cb.simulate_exits(loud(0.8, 0.0).replace(horizon=2.4), paths=10, rng=0).steps == 1002
+    assert cb.simulate_exits(loud(0.8, 0.0).replace(horizon=2.4), paths=10, rng=0, halve=False).steps == 1002
     with pytest.raises(ValueError, match="`steps` must be a multiple of the 5 sampling times, got 12"):
         cb.simulate_exits(loud(0.8), paths=10, rng=0, steps=12)
 

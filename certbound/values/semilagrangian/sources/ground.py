@@ -97,7 +97,8 @@ class Ground:
         widths, wide = (high - low, np.diff(self.q.knots)), np.diff(self.p.knots)[cell]
         corners, remainder = self.cells.corners[:, cell], np.ascontiguousarray(self.cells.remainder[:, cell])
         ends = [((end - self.p.knots[cell]) / wide)[None, :, None, None] for end in (low, high)]
-        corners = np.stack([corners[..., 0, :] * (1 - end) + corners[..., 1, :] * end for end in ends], axis=-2)
+        parts = [corners[..., 0, :] * (1 - end) + corners[..., 1, :] * end for end in ends]
+        corners = np.ascontiguousarray(np.stack(parts, axis=-2))
 
         def bounds(values: Array, rates: Array, source: Array, step: float) -> tuple[Array, Array, Array, Array]:
             return residual_bounds(

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import accumulate
 
 import numpy as np
 
@@ -37,6 +37,7 @@ _FIRST, _MOST = 256, 100_000  # cells at first, and at most
 _GOOD = 3e-4  # of L m, by which it may miss -1 in a cell that is not halved
 _HALVINGS, _IDLE = 24, 3  # rounds at most, and those without a gain, as rounding is in the way
 _WORST = 0.5  # of L m, by which it may miss -1 at all
+_BAND = 3  # entries beside the diagonal, on either side
 _STEEPER = 1 + 1e-6  # times the slope beyond a cut: that at the cut
 _CUTS, _NEAR = 12, 2e-3  # places of a cut, each twice as far as the one before; upper over lower bound, to be done
 
@@ -223,14 +224,9 @@ class _Mean:
         steps = Interval.point(self.nodes[1:]) - Interval.point(self.nodes[:-1])
         simpson = Interval.point(self.at_nodes[:-1]) + Interval.point(self.at_nodes[1:])
         parts = steps * (simpson + Interval.point(4.0) * Interval.point(self.at_middles)) / Interval.point(6.0)
-        low, high = np.zeros(len(self.nodes)), np.zeros(len(self.nodes))
-        order = range(len(parts.lo)) if not self.free[0] else range(len(parts.lo) - 1, -1, -1)
-        for k in order:
-            here, there = (k, k + 1) if not self.free[0] else (k + 1, k)
-            ends = (parts.lo[k], parts.hi[k]) if not self.free[0] else (-parts.hi[k], -parts.lo[k])
-            low[there] = np.nextafter(low[here] + ends[0], -np.inf)
-            high[there] = np.nextafter(high[here] + ends[1], np.inf)
-        return Interval(low, high)
+        low, high = (-parts.hi[::-1], -parts.lo[::-1]) if self.free[0] else (parts.lo, parts.hi)
+        low, high = _sums(low, -math.inf), _sums(high, math.inf)
+        return Interval(low[::-1], high[::-1]) if self.free[0] else Interval(low, high)
 
     @property
     def upper(self) -> float:
@@ -274,6 +270,11 @@ class _Mean:
         return Interval(np.minimum(between.lo, points.lo[1:]), np.maximum(between.hi, points.hi[1:]))
 
 
+def _sums(parts: Array, to: float) -> Array:
+    """0 and the sums of the first parts, each of them rounded towards ``to``."""
+    return np.array(list(accumulate(parts.tolist(), lambda a, b: math.nextafter(a + b, to), initial=0.0)))
+
+
 def _quadratic(at_nodes: Array, at_middles: Array) -> Interval:
     """Ranges over the cells of quadratics by their values at both ends and the middle: those of the Bernstein form."""
     first, middle, last = Interval.point(at_nodes[:-1]), Interval.point(at_middles), Interval.point(at_nodes[1:])
@@ -314,41 +315,34 @@ def _generated(model: _Model, nodes: Array, at_nodes: Array, at_middles: Array) 
 def _collocated(model: _Model, nodes: Array, free: tuple[bool, bool], slope: float) -> tuple[Array, Array] | None:
     """m' at nodes and middles with L m = -1 at two points a cell, in floats; None where that has no solution.
 
-    The integral of m' is 0, or m' is ``slope`` at the end beyond which m goes on.
+    The integral of m' is 0, or m' is ``slope`` at the end beyond which m goes on. Unknown, too, is m at the nodes, so
+    that the matrix has entries beside its diagonal only: three equations a cell, and one of each end.
     """
-    from scipy.sparse import csc_matrix
-    from scipy.sparse.linalg import splu
+    from scipy.linalg import solve_banded
 
     count, steps = len(nodes) - 1, np.diff(nodes)
-    rows, columns, entries = [], [], []
+    first = 3 * np.arange(count)  # place of m at the cell's first node; m' there, and m' at the middle, come next
+    entries = []
     for number, t in enumerate((0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12))):
         f, a = model.values(nodes[:-1] + t * steps)
         shapes = (1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)
         slopes = 4 * t - 3, 4 - 8 * t, 4 * t - 1
-        for place, (shape, change) in enumerate(zip(shapes, slopes)):
-            rows.append(2 * np.arange(count) + number)
-            columns.append(2 * np.arange(count) + place)
-            entries.append(f * shape + a / 2 * change / steps)
-    right = -np.ones(2 * count + 1)
-    if any(free):
-        columns.append(np.array([0 if free[0] else 2 * count]))
-        entries.append(np.ones(1))
-        right[-1] = slope
-    else:
-        weights = np.zeros(2 * count + 1)
-        weights[0:-1:2] += steps / 6
-        weights[2::2] += steps / 6
-        weights[1::2] += 4 * steps / 6
-        columns.append(np.arange(2 * count + 1))
-        entries.append(weights)
-        right[-1] = 0.0
-    rows.append(np.full(len(columns[-1]), 2 * count))
-    values = np.concatenate(entries)
-    if not np.isfinite(values).all():
+        for place, shape, change in zip((1, 2, 4), shapes, slopes):
+            entries.append((1 + number, place, f * shape + a / 2 * change / steps))
+    entries += [(3, place, weight * steps) for place, weight in ((1, 1 / 6), (2, 4 / 6), (4, 1 / 6))]
+    entries += [(3, 0, np.ones(count)), (3, 3, -np.ones(count))]
+    matrix = np.zeros((2 * _BAND + 1, 3 * count + 2))
+    for row, place, values in entries:
+        matrix[_BAND + row - place, first + place] = values
+    right = np.zeros(3 * count + 2)
+    right[first + 1] = right[first + 2] = -1.0
+    for row, place, is_free in ((0, 0, free[0]), (3 * count + 1, 3 * count, free[1])):
+        matrix[_BAND + row - place - is_free, place + is_free] = 1.0
+        right[row] = slope if is_free else 0.0
+    if not np.isfinite(matrix).all():
         return None
     try:
-        places: Any = np.concatenate(rows), np.concatenate(columns)
-        found = splu(csc_matrix((values, places))).solve(right)
-    except RuntimeError:  # singular
+        found = solve_banded((_BAND, _BAND), matrix, right, overwrite_ab=True, overwrite_b=True, check_finite=False)
+    except np.linalg.LinAlgError:  # singular
         return None
-    return (found[0::2], found[1::2]) if np.isfinite(found).all() else None
+    return (found[1::3], found[2::3]) if np.isfinite(found).all() else None
