@@ -64,7 +64,7 @@ def problem(width: int, activation: str, kind: str, form: str) -> cb.Problem:
     h, noise = 0.05, np.array([0.005, 0.02])
     asked: dict[str, Any] = {
         "initial": cb.Box([0.05, -0.01], [0.06, 0.01]), "safe": [cb.Inside(cb.Box([-0.5, -0.9], [0.5, 0.9]))],
-        "delta": 1e-3,
+        "delta": 1e-3, "domain": cb.Box([-1.0, -2.0], [1.0, 2.0]),  # slopes of wide networks are not bounded on R^n
     }  # fmt: skip
     if kind == "continuous":
         system: Any = cb.ContinuousSystem(rates, states=["x", "v"], diffusion=np.diag(noise))
