@@ -174,9 +174,9 @@ def _claimed(path: Path, problem: Problem) -> float:
             f"`{path}` speaks of another problem than the one to be simulated: {difference}",
             "simulate with the problem, --set and --horizon that it was written for",
         )
-    level = math.nan
-    with contextlib.suppress(ValueError, TypeError):
-        level = float.fromhex(claim.get("log10_delta"))
+    written, level = claim.get("log10_delta"), math.nan
+    with contextlib.suppress(ValueError):
+        level = float.fromhex(written) if isinstance(written, str) else math.nan
     if not level <= 0:
         raise InputError(f"`{path}` claims no probability (`log10_delta`)", cure)
     return level

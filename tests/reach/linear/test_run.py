@@ -147,6 +147,16 @@ def test_too_much_noise_is_an_honest_unknown() -> None:
     assert answer.reason
 
 
+@pytest.mark.parametrize("sigma", [0.1, 3.0])
+def test_a_fixed_point_is_looked_for_along_the_inner_rows_alone(sigma: float) -> None:
+    run = LinearRun(Linearisation.of(oscillator(sigma)))
+    bounds = run.probability(Share.of(1e-3)).bounds
+    assert ("supports" in vars(run)) == (bounds is not None)  # the faces of what is asked only if there is one
+    for inner, whole in zip(run.inner_supports, run.supports, strict=True):
+        assert inner.y.shape[1] == run.inner < whole.y.shape[1]
+        np.testing.assert_allclose(inner.y, whole.y[:, : run.inner], rtol=1e-12)
+
+
 def test_twelve_states_in_discrete_time() -> None:
     a = 0.9 * np.eye(12) + 0.05 * np.eye(12, k=1)
     system = cb.DiscreteSystem(
