@@ -12,8 +12,8 @@ Traceback (most recent call last):
 certbound.errors.CertificateError: `certificate` must have `version`.
 """
 
-from certbound.checker.check import SECONDS, VERSION, check_data, check_file
+from certbound.checker.check import SECONDS, VERSION, check_data, check_file, find_difference
 from certbound.checker.reading import parse, read
 from certbound.checker.report import Report
 
-__all__ = ["SECONDS", "VERSION", "Report", "check_data", "check_file", "parse", "read"]
+__all__ = ["SECONDS", "VERSION", "Report", "check_data", "check_file", "find_difference", "parse", "read"]

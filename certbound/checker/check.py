@@ -100,6 +100,36 @@ def check_data(
                       proved=True)  # fmt: skip
 
 
+def find_difference(data: Mapping[str, Any], problem: Mapping[str, Any], *, seconds: float = SECONDS) -> str:
+    """Where a certificate's problem differs first from another one, in words; empty where they are the same.
+
+    Nothing is proved. Names for humans, the order of operations and ``delta``, which no bound depends on, do not count.
+
+    Parameters
+    ----------
+    data : mapping
+        The certificate, as `certbound.checker.reading.parse` returns it.
+    problem : mapping
+        The ``problem`` part of another certificate.
+    seconds : float
+        Limit on the work, as `check_data` has it.
+
+    Raises
+    ------
+    CertificateError
+        If the certificate states no problem, or one that is malformed.
+    """
+    if "problem" not in data:
+        raise CertificateError("the certificate states no problem; give the file of verify --certificate.")
+    mine = data["problem"]
+    with ctx.workprec(PRECISION):
+        try:
+            read_model(mine, Budget(seconds))
+        except Unproved as error:
+            raise CertificateError(f"`problem` cannot be read: {error}.") from error
+    return shortened(first_difference(mine, {**problem, "delta": mine["delta"]}), 200)
+
+
 def _levels(stated: Record) -> tuple[float, float | None]:
     """The claimed upper bound, and the lower one of a certificate that claims one, and then nothing else."""
     level = stated.number("log10_delta")

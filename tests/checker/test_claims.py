@@ -254,11 +254,12 @@ def test_what_no_drawn_value_makes_likely_is_certified_as_far_as_balls_tell() ->
     assert report.log10_delta < -20
 
 
+@pytest.mark.parametrize("name", ["check_data", "parse"])
 def test_a_certificate_that_is_too_large_for_the_checker_leaves_those_of_other_engines(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     problem = cb.Problem(STEP, initial=[0.2], safe=SIDE, horizon=2, delta=0.2)
-    one, other = (verify_safety(problem, method=name) for name in ("linear", "constants"))
+    one, other = (verify_safety(problem, method=key) for key in ("linear", "constants"))
     verdict = replace(one, answers=one.answers | other.answers)
     best = parse(proved_certificate(problem, verdict))["claim"]["method"]
 
@@ -267,5 +268,13 @@ def test_a_certificate_that_is_too_large_for_the_checker_leaves_those_of_other_e
             raise CertificateError("`proof.grids[0]` must make at most 100000 cells.")
         return check_data(data, *given, **options)
 
-    monkeypatch.setattr("certbound.checker.check_data", small)
+    def shorter(text: str) -> Data:
+        if json.loads(text)["claim"]["method"] == best:
+            raise CertificateError("the certificate is longer than 16 MiB.")
+        return parse(text)
+
+    monkeypatch.setattr(f"certbound.checker.{name}", {"check_data": small, "parse": shorter}[name])
     assert parse(proved_certificate(problem, verdict))["claim"]["method"] != best
+    alone = replace(one, answers={key: answer for key, answer in verdict.answers.items() if key == best})
+    with pytest.raises(CertificateError, match=f"checker: {best}: "):
+        proved_certificate(problem, alone)

@@ -186,8 +186,8 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
             engine = str(data["claim"]["method"])
             report = check_data(data, problem_data(problem), allow_assumptions=True)
         except CertificateError as error:  # larger than the checker accepts: what was proved with less effort stands
-            reason = str(error)
-            continue
+            engine, reason = str(json.loads(text)["claim"]["method"]), str(error)
+            break
         finally:
             checking.append(time.perf_counter() - begun)
         if report.valid and report.log10_lower_proved is not None:

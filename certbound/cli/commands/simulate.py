@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import sys
 import warnings
@@ -84,7 +83,7 @@ def simulate(
             "`--time-limit` and `--checkpoint` exclude each other", "stop a run with Ctrl-C and go on later"
         )
     subject = load_problem(problem, pairs, horizon=horizon)
-    claim = None if against is None else _claimed(against)
+    claim = None if against is None else _claimed(against, subject)
     options: dict[str, Any] = {"paths": paths, "steps": _steps(subject, step), "confidence": confidence}
     if seed is not None or checkpoint is None:
         options["rng"] = rng
@@ -158,23 +157,29 @@ def _step(effect: Any) -> dict[str, Any]:
     return {"step": None if effect is None else attributes(effect, "adds", "lower", "upper", "paths")}
 
 
-def _claimed(path: Path) -> float:
-    """log10 of the probability that a certificate claims."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"`{path}` is no certificate: {error}", "give the file of verify --certificate") from error
-    claim = content.get("claim") if isinstance(content, dict) else None
-    if isinstance(claim, dict) and "log10_lower" in claim:
+def _claimed(path: Path, problem: Problem) -> float:
+    """log10 of the probability that a certificate claims of this very problem."""
+    from certbound.checker import find_difference, read
+    from certbound.safety.certificate import problem_data
+
+    content, cure = read(path), "give the file of verify --certificate"
+    claim = content.get("claim")
+    if not isinstance(claim, dict):
+        raise InputError(f"`{path}` claims no probability (`log10_delta`)", cure)
+    if "log10_lower" in claim:
         raise InputError(f"`{path}` claims a lower bound", "compare with a certificate of SAFE")
-    for part in (content, claim):
-        value = part.get("log10_delta") if isinstance(part, dict) else None
-        if isinstance(value, str):
-            with contextlib.suppress(ValueError):
-                value = float.fromhex(value)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and value <= 0:
-            return float(value)
-    raise InputError(f"`{path}` claims no probability (`log10_delta`)", "give the file of verify --certificate")
+    difference = find_difference(content, problem_data(problem))
+    if difference:
+        raise InputError(
+            f"`{path}` speaks of another problem than the one to be simulated: {difference}",
+            "simulate with the problem, --set and --horizon that it was written for",
+        )
+    written, level = claim.get("log10_delta"), math.nan
+    with contextlib.suppress(ValueError):
+        level = float.fromhex(written) if isinstance(written, str) else math.nan
+    if not level <= 0:
+        raise InputError(f"`{path}` claims no probability (`log10_delta`)", cure)
+    return level
 
 
 @contextlib.contextmanager

@@ -113,7 +113,7 @@ class DiffusionRun(LinearRun):
             return None
         value = value - reference.value.reshape(value.shape)
         shape = (engine.pieces, *self.tape.shape)
-        return [value[k * engine.pieces : (k + 1) * engine.pieces].reshape(*shape) for k in range(len(self.supports))]
+        return [value[k * engine.pieces : (k + 1) * engine.pieces].reshape(*shape) for k in range(self.engine.cells)]
 
     def events(self, cell: int, shared: Share) -> SplitEvents:
         """Scalar events of Z + M of one cell; half of the shared probability is granted to each."""
@@ -175,7 +175,7 @@ class DiffusionRun(LinearRun):
                 continue
             accepted, bounds, share = found
             _, events = self.levels(nonlinear)
-            outcomes = [self._cell(k, bounds, events[k], nonlinear) for k in range(len(self.supports))]
+            outcomes = [self._cell(k, bounds, events[k], nonlinear) for k in range(self.engine.cells)]
             worst = max(outcomes, key=lambda outcome: outcome.log_probability)
             if best.bounds is None or worst.log_probability < best.log_probability:
                 best, kept = worst, accepted

@@ -66,14 +66,20 @@ class Inclusion:
 
     @cached_property
     def supports(self) -> list[Supports]:
-        """The supports of every cell."""
-        found = []
-        for cell, inner in enumerate(self.rows):
-            if not self.engine.continuous:
-                inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
-            rows = np.concatenate([inner, *(rows[:, None] for rows in self.outer(cell))], axis=1)
-            found.append(self.engine.supports(cell, rows, self.engine.moved))
-        return found
+        """The supports of every cell, along the inner rows first."""
+        return [self._supports(cell, self.outer(cell)) for cell in range(self.engine.cells)]
+
+    @cached_property
+    def inner_supports(self) -> list[Supports]:
+        """The same along the inner rows alone, of which a fixed point asks again and again."""
+        return [self._supports(cell, ()) for cell in range(self.engine.cells)]
+
+    def _supports(self, cell: int, outer: Sequence[Array]) -> Supports:
+        inner = self.rows[cell]
+        if not self.engine.continuous:
+            inner = np.concatenate([inner, np.zeros((1, *inner.shape[1:]))])
+        rows = np.concatenate([inner, *(rows[:, None] for rows in outer)], axis=1)
+        return self.engine.supports(cell, rows, self.engine.moved)
 
     @property
     def nothing(self) -> tuple[Array, Array]:
@@ -89,8 +95,8 @@ class Inclusion:
         """Bounds of s = y + Z + R along the inner rows over all pieces: (B N, D)."""
         n = self.engine.pieces
         lows, highs = [], []
-        for support, level, (r_lo, r_hi) in zip(self.supports, levels, remainder, strict=True):
-            y = support.y[:n, : self.inner]
+        for support, level, (r_lo, r_hi) in zip(self.inner_supports, levels, remainder, strict=True):
+            y = support.y[:n]
             lows.append(-y - level + r_lo[:n, : self.inner])
             highs.append(y + level + r_hi[:n, : self.inner])
         low, high = np.concatenate(lows), np.concatenate(highs)
@@ -213,7 +219,7 @@ class Inclusion:
 
     def deviations(self, levels: Array, low: Array, high: Array) -> tuple[Array, Array] | None:
         """The polytope that bounds on beta imply, or None where it is beyond all use."""
-        reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(self.supports, low, high, strict=True)]
+        reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(self.inner_supports, low, high, strict=True)]
         p_low, p_high = self.polytope(levels, reach)
         with np.errstate(invalid="ignore"):
             beyond = ~(np.isfinite(p_low) & np.isfinite(p_high)) | (p_high - p_low > self._limit(levels))
@@ -225,7 +231,7 @@ class Inclusion:
     def _limit(self, levels: Array) -> Array:
         """The widest polytope that is of any use, in the units of every row: (B N, D)."""
         count = self.engine.pieces
-        moved = np.stack([2 * support.y[:count, : self.inner] for support in self.supports]) + 2 * levels
+        moved = np.stack([2 * support.y[:count] for support in self.inner_supports]) + 2 * levels
         size = np.abs(self.rows) @ self.engine.sizes + moved
         widest = np.broadcast_to(size.max(axis=(0, 1), initial=0.0), (size.shape[0] * count, self.inner))
         return np.where(widest > 0, _HUGE * widest, np.inf)

@@ -136,6 +136,9 @@ class Supports:
 
     def remainder(self, low: Array, high: Array) -> tuple[Array, Array, Array]:
         """Bounds of R over every piece from those of beta (N, n): lower, upper (N, D), and |R| at the nodes."""
+        if not (np.any(low) or np.any(high)):  # what is not there moves nothing
+            none = np.zeros((len(self.rows), self.count))
+            return none, none.copy(), np.zeros((self.pieces + 1, self.n))
         g, h = self.gathering, self.step
         middle = (low + high) / 2
         radius = np.maximum(high - middle, middle - low) * (1 + 1e-15)

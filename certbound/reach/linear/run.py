@@ -167,7 +167,7 @@ class LinearRun(Inclusion):
         if guess is None:
             return 0.0
         worst = -np.inf
-        for cell in range(len(self.supports)):
+        for cell in range(self.engine.cells):
             poll(self.phase("a guess of the probability", cell))
             worst = max(worst, self._cell(cell, guess, events[cell], nonlinear, limit).log_probability)
             if worst > limit:
@@ -183,7 +183,7 @@ class LinearRun(Inclusion):
             self.lost = self.lost if bounds is not None else max(self.lost, nonlinear.log)
         if bounds is None or not events:  # without events the noise-free reachable set alone
             return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
-        outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(len(self.supports))]
+        outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(self.engine.cells)]
         return max(outcomes, key=lambda outcome: outcome.log_probability)
 
     def phase(self, work: str, cell: int) -> str:

@@ -233,7 +233,7 @@ def widened(run: LinearRun, levels: Array, found: tuple[Array, Array], pad: floa
 
 def _implied(run: LinearRun, levels: Array, boxes: tuple[Array, Array]) -> tuple[Array, Array] | None:
     """The polytope of deviations that boxes of beta imply; None where it is not bounded."""
-    reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.supports, *boxes, strict=True)]
+    reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.inner_supports, *boxes, strict=True)]
     if not all(np.isfinite(part).all() for pair in reach for part in pair):
         return None
     low, high = run.polytope(levels, reach)
@@ -371,7 +371,7 @@ def _cost(rows: Array, hessian: Array, width: Array) -> float:
 
 
 def _widths(run: LinearRun, stated: Stated, cell: int) -> Array:
-    reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.supports, *stated.bounds, strict=True)]
+    reach = [s.remainder(lo, hi)[:2] for s, lo, hi in zip(run.inner_supports, *stated.bounds, strict=True)]
     low, high = run.polytope(stated.levels, reach)
     pieces = run.engine.pieces
     return np.asarray((high - low)[cell * pieces : (cell + 1) * pieces] / 2)

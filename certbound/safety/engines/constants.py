@@ -173,7 +173,7 @@ class _Work:
         if start != NO_START:
             constants = constants.with_full_dimension()
         answer = EngineAnswer(reach=reach, constants=constants, method=self.name, assumption=self._assumed(constants))
-        refused = self._refused(reach, erosion, answer)
+        refused = self._refused(reach, erosion, answer, start)
         if refused is not None:
             return refused
         return self._decided(answer, erosion, constants, start)
@@ -275,7 +275,9 @@ class _Work:
         numbers = f"{name} = {value}, sigma = {constants.sigma}, {where}, in {norm}"
         return f"the stated constants ({numbers}) are assumed, not proved"
 
-    def _refused(self, reach: ReachTube, erosion: Erosion, answer: EngineAnswer) -> EngineAnswer | None:
+    def _refused(
+        self, reach: ReachTube, erosion: Erosion, answer: EngineAnswer, start: Start = NO_START
+    ) -> EngineAnswer | None:
         """An answer where the reach tube ends early or leaves no room; None where it serves."""
         worst = erosion.tightest()
         held = replace(answer, **worst.place)
@@ -284,15 +286,15 @@ class _Work:
                 held, time=reach.end, reach=reach,
                 reason=f"the reach tube could not be proved beyond t = {reach.end:.4g}; {self._cure}.",
             )  # fmt: skip
-        if erosion.broken():
+        if erosion.broken(random_start=start != NO_START):
             most = np.max(erosion.least, initial=0.0, where=np.isfinite(erosion.least))
             lost = bool(most > 0 and not -worst.margin < _BURST * most)
             words = "is proved so widely only that it leaves" if lost else "already leaves"
-            short = "" if lost else f" (short by {-worst.margin:.3g})"
+            short = "" if lost or worst.margin == 0 else f" (short by {-worst.margin:.3g})"
             return replace(
                 answer if lost else held,
                 reason=f"the noise-free reach tube {words} no room for '{worst.label}' at "
-                f"{self._when(worst.time)}{short}; {self._cure}.",
+                f"{self._when(worst.time)}{short}; {'start elsewhere' if worst.time == 0 else self._cure}.",
             )
         return None
 

@@ -84,10 +84,13 @@ class Erosion:
         per_step[-1] = min(per_step[-1], owed[-1])
         return np.arange(steps + 1, dtype=float), per_step
 
-    def broken(self) -> bool:
-        """Whether the reach tube alone leaves no room somewhere (at t = 0 of discrete time none is needed)."""
+    def broken(self, *, random_start: bool = False) -> bool:
+        """Whether the reach tube alone leaves no room somewhere.
+
+        At t = 0 of discrete time none is needed, unless S_0 is random.
+        """
         values = self.least
-        if self.continuous:
+        if self.continuous or random_start:
             return bool(np.any(values <= 0))
         return bool(values[0] < 0 or np.any(values[1:] <= 0))
 

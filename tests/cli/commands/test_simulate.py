@@ -4,7 +4,9 @@ import json
 
 import pytest
 
+import certbound as cb
 from certbound.cli.app import run
+from certbound.safety.certificate import problem_data
 
 KEYS = {
     "paths", "exits", "probability", "lower", "upper", "confidence", "path_steps_per_second", "seconds", "step",
@@ -92,12 +94,16 @@ def test_without_an_exit_no_bound_is_refuted(capsys):
     assert "it refutes no bound, and supports none below 0.005" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("claim", "code"), [(-1, 1), (-0.5, 0), ("-0x1.0p+0", 1)])
-@pytest.mark.parametrize("nested", [False, True])
-def test_a_certificate_is_contradicted_or_not(tmp_path, capsys, claim, code, nested):
+def claimed(path, level, **changes):
+    """A file that claims 10^level of ou with radius 0.8."""
+    problem = problem_data(cb.load("ou", radius=0.8).replace(**changes))
+    path.write_text(json.dumps({"claim": {"log10_delta": float(level).hex()}, "problem": problem}))
+
+
+@pytest.mark.parametrize(("claim", "code"), [(-1, 1), (-0.5, 0)])
+def test_a_certificate_is_contradicted_or_not(tmp_path, capsys, claim, code):
     path = tmp_path / "cert.json"
-    content = {"log10_delta": claim}
-    path.write_text(json.dumps({"claim": content} if nested else content))
+    claimed(path, claim, delta=1e-9, name="of another name")  # neither counts
     words = ("ou", "--paths", "5000", "--seed", "1", "--set", "radius=0.8", "--against", str(path))
     found = answer(capsys, *words, code=code)
     assert found["against"]["contradicted"] is bool(code)
@@ -106,10 +112,33 @@ def test_a_certificate_is_contradicted_or_not(tmp_path, capsys, claim, code, nes
     assert word in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"log10_delta": 3}', '{"log10_delta": "nan"}', "[" * 100_000])
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [(("--set", "radius=0.9"), "constraints[0]"), (("--set", "radius=0.8", "--horizon", "6"), "horizon")],
+)
+def test_a_certificate_of_another_problem_is_refused(tmp_path, capsys, words, place):
+    path = tmp_path / "cert.json"
+    claimed(path, -1)
+    said = refusal(capsys, "ou", "--paths", "10", "--against", str(path), *words)
+    assert "speaks of another problem than the one to be simulated" in said
+    assert place in said
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "[]", "{}", '{"log10_delta": 3}', '{"claim": {"log10_delta": "-0x1p+0"}}', '{"claim": 3}', "[" * 100_000,
+     '{"claim": {"log10_delta": "-0x1p+0"}, "problem": 3}'],
+)  # fmt: skip
 def test_a_file_that_is_no_certificate_is_refused(tmp_path, capsys, content):
     path = tmp_path / "cert.json"
     path.write_text(content)
+    assert "certbound: " in refusal(capsys, "ou", "--paths", "10", "--against", str(path))
+
+
+@pytest.mark.parametrize("level", ["nan", "0x1p+0", "x", 3])
+def test_a_claim_that_is_no_probability_is_refused(tmp_path, capsys, level):
+    path = tmp_path / "cert.json"
+    path.write_text(json.dumps({"claim": {"log10_delta": level}, "problem": problem_data(cb.load("ou"))}))
     assert "verify --certificate" in refusal(capsys, "ou", "--paths", "10", "--against", str(path))
 
 

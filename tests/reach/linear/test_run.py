@@ -147,6 +147,29 @@ def test_too_much_noise_is_an_honest_unknown() -> None:
     assert answer.reason
 
 
+@pytest.mark.parametrize("sigma", [0.1, 3.0])
+def test_a_fixed_point_is_looked_for_along_the_inner_rows_alone(sigma: float) -> None:
+    run = LinearRun(Linearisation.of(oscillator(sigma)))
+    bounds = run.probability(Share.of(1e-3)).bounds
+    assert ("supports" in vars(run)) == (bounds is not None)  # the faces of what is asked only if there is one
+    for inner, whole in zip(run.inner_supports, run.supports, strict=True):
+        assert inner.y.shape[1] == run.inner < whole.y.shape[1]
+        np.testing.assert_allclose(inner.y, whole.y[:, : run.inner], rtol=1e-12)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_what_is_no_remainder_moves_nothing(discrete: bool) -> None:
+    step = cb.DiscreteSystem(lambda x: 0.9 * x - 0.1 * x**3, states=2, noise=cb.Gaussian(std=[0.1, 0.1]))
+    problem = oscillator().replace(system=step, horizon=5) if discrete else oscillator()
+    run = LinearRun(Linearisation.of(problem))
+    none = np.zeros(run.engine.shape[1:])
+    for support in (run.supports[0], run.inner_supports[0]):
+        found, close = support.remainder(none, none), support.remainder(none, none + 1e-250)
+        assert [part.shape for part in found] == [part.shape for part in close]
+        assert not any(part.any() for part in found)
+        assert all(np.abs(part).max() < 1e-200 for part in close)
+
+
 def test_twelve_states_in_discrete_time() -> None:
     a = 0.9 * np.eye(12) + 0.05 * np.eye(12, k=1)
     system = cb.DiscreteSystem(

@@ -7,11 +7,12 @@ import pytest
 
 from certbound.problem.noise import Gaussian
 from certbound.problem.problem import Problem
-from certbound.problem.sets.constraints import Inside, Outside
+from certbound.problem.sets.constraints import GaussianStart, Inside, Outside
 from certbound.problem.sets.regions import Ball, Box, HalfSpace
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem
 from certbound.reach.contraction.uniform import contraction_tube
 from certbound.rigor.norms import Norm
+from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
 from certbound.tubes.constants import Constants
 
@@ -90,6 +91,16 @@ def test_discrete_time_owes_nothing_at_step_zero_and_covers_the_last_step():
     assert erosion.profile(random_start=True)[1][0] == pytest.approx(0.0, abs=1e-12)
     one = erode(contraction_tube(problem.replace(horizon=1), constants), problem, Norm(1))
     assert one.profile()[1] == pytest.approx([1.0])
+
+
+def test_a_random_start_needs_room_at_step_zero():
+    system = DiscreteSystem(lambda x: 0.9 * x, states=2, noise=Gaussian(std=[0.05, 0.05]))
+    start = GaussianStart([0.0, 1.0], np.diag([0.01, 0.0]))
+    problem = Problem(system, initial=start, safe=[Inside(HalfSpace([0.0, 1.0], 1.0))], horizon=5)
+    answer = constants_engine(problem)
+    assert not answer.log10_delta < 0
+    assert "leaves no room" in answer.reason
+    assert "at step 0; start elsewhere" in answer.reason
 
 
 def test_a_reach_tube_that_breaks_a_constraint_is_broken():

@@ -14,7 +14,7 @@ from certbound.problem.model import compile_numpy
 from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.values.semilagrangian.carried import bound_carried_exits
 from certbound.values.semilagrangian.carried.carried_exits import bound_by_kicks
-from certbound.values.semilagrangian.carried.carried_grid import Fineness, layout_of
+from certbound.values.semilagrangian.carried.carried_grid import Fineness, axes_of, layout_of
 from certbound.values.semilagrangian.carried.carried_problem import Voyage, voyage_of
 from certbound.values.semilagrangian.carried.carried_step import Layout, back, terminal
 
@@ -138,6 +138,26 @@ def test_who_surely_leaves_counts_1(ready) -> None:
     ],
 )
 def test_what_is_not_served_is_said(problem, words) -> None:
+    with pytest.raises(InfeasibleError, match=words):
+        bound_carried_exits(problem)
+
+
+@pytest.mark.parametrize("rates", [(0.0, 0.0), (0.0, 1.0), (1e-250, 0.0)])
+def test_states_that_stand_still_have_a_grid(rates) -> None:
+    voyage = voyage_of(vehicle(f=lambda x: [rates[0] * x[1], rates[1] * x[2], -x[2]]))
+    assert all(10 < len(axis) < 1000 for axis in axes_of(voyage, COARSE, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        (vehicle(s=1e-170, safe=[cb.Inside(cb.Box([-1, -1, -1], [1, 1, 1]))]), "the noise of a step is less than"),
+        (vehicle(s=1e-3, safe=[cb.Inside(cb.Box([-1, -1, -1], [1, 1, 1]))]), "the coarsest grid asks for"),
+        (vehicle(f=lambda x: [np.log(x[0]), x[2], -x[2]], start=(-0.9, 0.0, 0.0),
+                 safe=[cb.Inside(cb.Box([-1, -1, -1], [-0.8, 1, 1]))]), "undefined all over"),
+    ],
+)  # fmt: skip
+def test_grids_that_cannot_be_made_are_refused(problem, words) -> None:
     with pytest.raises(InfeasibleError, match=words):
         bound_carried_exits(problem)
 

@@ -8,6 +8,7 @@ import time
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.problem.model import compile_numpy, jacobian
 from certbound.problem.problem import Problem
 from certbound.rigor.intervals import Interval
@@ -23,6 +24,8 @@ _PLANS = ((0.1, 16, 0.6), (0.07, 28, 0.5), (0.05, 40, 0.5), (0.05, 60, 0.5), (0.
 """Lengths of the steps, relative to the time in which f turns; cells between faces; cells along q."""
 _RATE = 350_000
 """Nodes times steps that are done in a second."""
+_LONGEST = 600.0
+"""Seconds beyond which the coarsest grid is left out where less was asked for."""
 _OMEGA = 4.2  # for answers not far below 1; others ask for more
 _LEAST, _MOST = 8, 2000
 
@@ -61,13 +64,19 @@ def bound_carried_exits(problem: Problem, *, seconds: float = 20.0) -> ExitBound
 
 
 def _affordable(voyage: Voyage, work: float, omega: float) -> list[Fineness]:
-    """The finest of the plans whose nodes times steps are at most ``work``."""
+    """The finest of the plans whose nodes times steps are at most ``work``; or else the coarsest, if it ever ends."""
     turn, chosen = _turn(voyage), None
     for share, cells, cell in _PLANS:
         count = min(max(_LEAST, math.ceil(voyage.horizon / (share * turn))), _MOST)
         plan = Fineness(count=count, cells=cells, edge=1.0, cell=cell, omega=omega)
         axes = axes_of(voyage, plan, voyage.horizon / count)
-        if chosen is not None and math.prod(len(axis) for axis in axes) * count > work:
+        asked = math.prod(len(axis) for axis in axes) * count
+        if chosen is None and asked > max(work, _RATE * _LONGEST):
+            raise InfeasibleError(
+                f"the coarsest grid asks for {asked / _RATE:.2g} s, as the noise of a step is small against the safe "
+                "set; value functions prove nothing here."
+            )
+        if chosen is not None and asked > work:
             break
         chosen = plan
     return [chosen] if chosen is not None else []
@@ -83,6 +92,8 @@ def _turn(voyage: Voyage) -> float:
         second = compile_numpy(jacobian(jacobian(voyage.tape, (STATES,)), (STATES,)))(0.0, *points)
     second = np.broadcast_to(second, (len(points[0]), STATES, 1))[..., 0]
     fine = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(second).all(axis=1)
+    if not fine.any():
+        raise InfeasibleError("the model is undefined all over the safe set; value functions prove nothing here.")
     slopes, second = slopes[fine], second[fine]
     rates = float(np.median(np.abs(np.linalg.eigvals(slopes)).max(axis=1)))
     bent = float(np.sqrt((second**2).mean() / max((slopes[..., -1] ** 2).mean(), 1e-300)))

@@ -19,6 +19,7 @@ from certbound.values.semilagrangian.remainders import upper_tail
 
 _UP = 1 + 1e-9
 _LEAST = 0.1  # of the widest cells
+_MOST = 1_000_000  # cells along q
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -78,14 +79,15 @@ def layout_of(voyage: Voyage, fineness: Fineness) -> Layout:
 
 
 def axes_of(voyage: Voyage, fineness: Fineness, step: float) -> tuple[Array, Array, Array]:
-    """Nodes along x, y and q."""
+    """Nodes along x, y and q; InfeasibleError where the noise is so small that q would need too many."""
     speed, turn = _speeds(voyage)
     found = []
     for (low, high), fastest, most in zip(voyage.ends[:2], speed, turn):
         wide = (high - low) / fineness.cells
         beyond = 2.2 * step * fastest + 3 * wide
         depth = np.linspace(0.0, (high - low) / 2, 60)
-        blur = most * voyage.noise * (step + depth / max(fastest, 1e-300)) ** 1.5  # of a front that has come that far
+        long = np.minimum(depth, voyage.horizon * fastest) / max(fastest, 1e-300)  # that a front has been on its way
+        blur = most * voyage.noise * (step + long) ** 1.5
         inside = np.clip(fineness.edge * blur, _LEAST * wide, wide)
         close = 3 * inside[0]
         half = np.concatenate([[-beyond, -close], depth]), np.concatenate([[wide, inside[0]], inside])
@@ -94,6 +96,11 @@ def axes_of(voyage: Voyage, fineness: Fineness, step: float) -> tuple[Array, Arr
         found.append(graded_axis(low - beyond, high + beyond, places, widths, (low, high)))
     low, high = voyage.ends[2]
     cell = fineness.cell * voyage.noise * math.sqrt(step)
+    if not high - low < _MOST * cell:
+        raise InfeasibleError(
+            f"the noise of a step is less than {1 / _MOST:g} of the way between the ends of the state that it moves; "
+            "value functions prove nothing here."
+        )
     count = math.ceil((high - low) / cell)
     cell = (high - low) / count
     return found[0], found[1], np.asarray(low + cell * np.arange(-3, count + 4))
