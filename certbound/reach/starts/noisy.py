@@ -37,12 +37,16 @@ _KEPT = 1e-3  # of the variance along them, that stays with the deviation: so th
 _FIRST = 3.0  # deviations at which the first cells end
 _TARGET = 0.1  # of delta: what a cell may cost without a closer look
 _LARGEST = 0.3
+_NOTHING = (1.0, 0.0)  # bounds that say nothing
 _UP, _DOWN = 1 + 1e-12, 1 - 1e-12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Part:
-    """A cell (d,), its mass from both sides, and the bounds that hold from each of its starts."""
+    """A cell (d,), its mass from both sides, and the bounds that hold from each of its starts.
+
+    It is ``lost`` where nothing is proved of it, nor of its middle or its start nearest to the mean alone.
+    """
 
     low: Array
     high: Array
@@ -51,11 +55,12 @@ class _Part:
     most: float
     axis: int
     judged: bool = False
+    lost: bool = False
 
     @property
     def gap(self) -> float:
         """What a closer look may gain."""
-        return self.mass[1] * (self.most - self.least)
+        return 0.0 if self.lost else self.mass[1] * (self.most - self.least)
 
 
 class NoisyStart:
@@ -124,13 +129,18 @@ class NoisyStart:
         poll(f"a cell of the random start ({len(self.parts)})")
         middle = (part.low + part.high) / 2
         half = np.maximum(part.high - middle, middle - part.low) * (1 + 1e-15)
+        lost = False
         if self.shared is not None and self.shared.serves:
             above, below = self.shared.above(middle, half), self.shared.below(middle, half) if self.from_below else 0.0
         else:
             above, below = self._alone(middle, half)
+            nearest = np.clip(0.0, part.low, part.high)
+            lost = (above, below) == _NOTHING and all(
+                self._alone(point, 0 * half) == _NOTHING for point in (nearest, middle)
+            )
         least, most = max(part.least, below), min(part.most, above)
         axis = int(np.argmax(half * self.weights))
-        return replace(part, least=min(least, most), most=most, axis=axis, judged=True)
+        return replace(part, least=min(least, most), most=most, axis=axis, judged=True, lost=lost)
 
     def _alone(self, middle: Array, half: Array) -> tuple[float, float]:
         """Upper and lower bounds that hold from every start of a cell, by the linear response of its own."""

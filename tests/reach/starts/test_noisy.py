@@ -10,6 +10,7 @@ import pytest
 import certbound as cb
 from certbound.errors import EngineError
 from certbound.reach.starts import bound_noisy_start
+from certbound.reach.starts.noisy import NoisyStart
 
 
 def turning(**changes: object) -> cb.Problem:
@@ -69,3 +70,20 @@ def test_obstacles_and_curved_models_are_bounded_by_the_engine_of_each_cell() ->
     simulated = cb.simulate_exits(problem, paths=10_000, steps=200, halve=False)
     assert found.lower <= simulated.upper
     assert simulated.lower <= found.upper < 0.75  # the mean meets the ball, and without cells nothing below 1 is proved
+
+
+def test_cells_of_whose_points_nothing_is_proved_are_not_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[float] = []
+
+    def nothing(self: object, middle: np.ndarray, half: np.ndarray) -> tuple[float, float]:
+        looked.append(float(half.max()))
+        return 1.0, 0.0
+
+    monkeypatch.setattr(NoisyStart, "_alone", nothing)
+    system = cb.DiscreteSystem(
+        lambda x: [0.9 * x[0] + 0.1 * x[1] ** 2, 0.9 * x[1]], states=2, noise=cb.Gaussian(std=0.02)
+    )
+    found = bound_noisy_start(turning(system=system, safe=[cb.Outside(cb.Ball([1.0, 1.0], 0.2))]), most=250, enough=never)
+    assert (found.lower, found.upper) == (0.0, 1.0)
+    assert len(looked) == 3 * 16
+    assert sum(half == 0 for half in looked) == 2 * 16
