@@ -307,6 +307,7 @@ class _Search:
         if before is not None and not before.applicable:
             return
         most = _UNLIKELY if self.bounded and not self._likely(name) else math.inf
+        most = min(most, _ANYWAY[self.problem.system.dimension <= _FEW]) if self.refuted else most
         with self.watch.share(_EXTRA if self.safe else 1.0, most):
             self.ask(name, replace(self.request, quick=quick, bounded=self.bounded, before=before and before.details))
 

@@ -33,7 +33,7 @@ from certbound.safety.verification import verify_safety
 from certbound.values.continuous import bound_exits
 from certbound.values.continuous.line import ladder
 from certbound.values.kolmogorov import Bounds, Witness
-from certbound.values.kolmogorov.box_setting import setting_of
+from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import refined, starts_in
 
@@ -242,7 +242,7 @@ def backward_answer(
     """What the backward equation bounds on one coarse grid, for short checks."""
     problem = build()
     n = problem.system.dimension
-    side = Side(setting_of(problem), np.full(n, cell), steps, not lower)
+    side = Side(stages_of(problem)[0], np.full(n, cell), steps, not lower)
     side.propose()
     bound = refined(side, starts_in(problem))[0]
     found = Bounds(

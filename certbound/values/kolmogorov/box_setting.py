@@ -137,12 +137,6 @@ class Setting:
         return np.linspace(self.begin, self.horizon, _MOMENTS) if changes else np.zeros(1)
 
 
-def setting_of(problem: Problem) -> Setting:
-    """A problem without windows, as `stages_of` reads it."""
-    (one,) = stages_of(problem)
-    return one
-
-
 def stages_of(problem: Problem) -> list[Setting]:
     """Read a problem: one setting for each stage of time between changes of its limits, in their order.
 

@@ -19,12 +19,17 @@ from certbound.rigor.intervals import Interval
 from certbound.values.enclosing import enclose
 from certbound.values.kolmogorov.axes import Grazing, Plan, Size, plan_axes
 from certbound.values.kolmogorov.box_setting import Setting
-from certbound.values.kolmogorov.changing import ChangingEquation
+from certbound.values.kolmogorov.equation import (
+    BREADTHS,
+    ChangingEquation,
+    Discretised,
+    at_knots,
+    at_nodes,
+    discretised,
+)
 from certbound.values.kolmogorov.face_exits import ALWAYS, Face, face_of, shortfall
 from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound, rough_residual
-from certbound.values.kolmogorov.solve import Discretised, discretised
-from certbound.values.kolmogorov.sources import BREADTHS, at_knots, at_nodes
 from certbound.values.kolmogorov.splines import (
     DEGREE,
     Axis,
@@ -124,8 +129,15 @@ def extended(nodes: Array, before: int, behind: int) -> Array:
 
 
 def mesh_of(
-    setting: Setting, nodes: list[Array], grazing: list[Grazing], row: int, pad: tuple[int, int], kill: bool,
-    span: float, fresh: Mask, early: bool = False,
+    setting: Setting,
+    nodes: list[Array],
+    grazing: list[Grazing],
+    row: int,
+    pad: tuple[int, int],
+    kill: bool,
+    span: float,
+    fresh: Mask,
+    early: bool = False,
 ) -> Mesh:
     """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones.
 
@@ -400,7 +412,8 @@ class Side:
             self.brief = self.steps < 4 * HALF * horizon
             self.clock = 2 * CLOCK * horizon / self.steps
         self.factors = [
-            None if one.factor is None
+            None
+            if one.factor is None
             else factor_of(one.factor, self.times, (begin, horizon), setting.nodes, setting.gaps)
             for one in setting.operators
         ]

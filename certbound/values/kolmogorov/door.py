@@ -16,7 +16,7 @@ from certbound.problem.sets import GaussianStart
 from certbound.values.kolmogorov.axes import plan_axes
 from certbound.values.kolmogorov.box_setting import Setting, stages_of
 from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.shares import Shape, better_shapes
+from certbound.values.kolmogorov.error_shares import Shape, better_shapes
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
 from certbound.values.kolmogorov.start_law import StartMean
 from certbound.values.kolmogorov.witness import Witness

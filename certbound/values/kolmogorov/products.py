@@ -131,8 +131,11 @@ def _powers(tape: Tape, slot: int) -> list[Tape] | None:
 
 
 def _rough(node: Node) -> bool:
-    return node.op in JUMPS or node.op in PARTS or node.op == "kink" or (
-        node.op in ROWS and (ROWS[node.op].kink is not None or ROWS[node.op].jump is not None)
+    return (
+        node.op in JUMPS
+        or node.op in PARTS
+        or node.op == "kink"
+        or (node.op in ROWS and (ROWS[node.op].kink is not None or ROWS[node.op].jump is not None))
     )
 
 

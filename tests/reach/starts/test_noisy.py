@@ -83,7 +83,8 @@ def test_cells_of_whose_points_nothing_is_proved_are_not_halved(monkeypatch: pyt
     system = cb.DiscreteSystem(
         lambda x: [0.9 * x[0] + 0.1 * x[1] ** 2, 0.9 * x[1]], states=2, noise=cb.Gaussian(std=0.02)
     )
-    found = bound_noisy_start(turning(system=system, safe=[cb.Outside(cb.Ball([1.0, 1.0], 0.2))]), most=250, enough=never)
+    problem = turning(system=system, safe=[cb.Outside(cb.Ball([1.0, 1.0], 0.2))])
+    found = bound_noisy_start(problem, most=250, enough=never)
     assert (found.lower, found.upper) == (0.0, 1.0)
     assert len(looked) == 3 * 16
     assert sum(half == 0 for half in looked) == 2 * 16

@@ -106,4 +106,4 @@ def test_the_backward_equation_is_solved_briefly_first_and_in_full_once_nothing_
     safe = [cb.Inside(cb.Box([-1, -3], [1, 3]))]
     assert verify_safety(Problem(system, initial=[0, 0], safe=safe, horizon=4.0, delta=0.1)).status == "UNKNOWN"
     assert asked[-1] == values._BACKWARD
-    assert sum(asked) <= 1.3 * values._BACKWARD
+    assert sum(asked) <= 1.5 * values._BACKWARD

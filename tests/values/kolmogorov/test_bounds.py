@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import certbound as cb
 from certbound.values.kolmogorov import bound_failing
-from certbound.values.kolmogorov.box_setting import setting_of
+from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import largest_at_start, refined, starts_in
 from certbound.values.kolmogorov.face_exits import face_of
@@ -68,7 +68,7 @@ def test_noise_in_the_velocity_alone_is_bounded_from_both_sides() -> None:
 @pytest.mark.parametrize("wrong", ["noise", *SHARES])
 def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -> None:
     problem, truth = two_independent()
-    setting, rng = setting_of(problem), np.random.default_rng(7)
+    setting, rng = stages_of(problem)[0], np.random.default_rng(7)
     side = Side(setting, np.full(2, 0.1), 12, above)
     side.propose()
     for rows in (side.values, side.rates):
@@ -84,7 +84,7 @@ def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e200])
 def test_a_proposal_that_blew_up_proves_nothing(poison: float) -> None:
     problem, _ = two_independent()
-    side = Side(setting_of(problem), np.full(2, 0.1), 12, True)
+    side = Side(stages_of(problem)[0], np.full(2, 0.1), 12, True)
     side.propose()
     side.values[3][7, 7] = poison
     assert refined(side, starts_in(problem))[0] == np.inf
@@ -94,7 +94,7 @@ def test_all_starts_of_a_box_are_covered_from_above_and_the_worst_counts_from_be
     problem, _ = two_independent()
     at = {place: 1 - survival(0.8, place, 2.0) ** 2 for place in (0.0, 0.4)}
     for above in (True, False):
-        side = Side(setting_of(problem), np.full(2, 0.1), 12, above)
+        side = Side(stages_of(problem)[0], np.full(2, 0.1), 12, above)
         side.propose()
         box, center, corner = (
             refined(side, starts_in(problem.replace(initial=start)))[0]
@@ -125,7 +125,7 @@ def test_three_states_are_bounded_from_above() -> None:
     system = cb.ContinuousSystem(lambda x, y, z: [-x, -y, -z], states=["x", "y", "z"], diffusion=0.5 * np.eye(3))
     box = cb.Box([-1] * 3, [1] * 3)
     problem = cb.Problem(system, initial=[0.2] * 3, safe=[cb.Inside(box)], horizon=0.5)
-    setting = setting_of(problem)
+    setting = stages_of(problem)[0]
     side = Side(setting, np.full(3, 0.15), 7, True)
     side.propose()
     assert 1 - survival(0.5, 0.2, 0.5) ** 3 <= refined(side, starts_in(problem))[0] < 1
@@ -136,7 +136,7 @@ def test_three_states_are_bounded_from_above() -> None:
 def test_a_start_beyond_the_box_of_the_values_is_not_read_off_a_continued_spline(far: float, above: bool) -> None:
     """Where a coordinate has no limit, the box holds nearly all paths, and perhaps not one start out of very many."""
     problem = oscillator()
-    side = Side(setting_of(problem), np.full(2, 0.2), 8, above)
+    side = Side(stages_of(problem)[0], np.full(2, 0.2), 8, above)
     side.propose()
     beyond = [side.axes[1].nodes[-1 if far > 0 else 0] + far]
     starts = starts_in(problem.replace(initial=[cb.Box([0, 0], [0, 0]), cb.Box([0, *beyond], [0, *beyond])]))
@@ -149,7 +149,7 @@ def test_a_drift_that_turns_on_the_face_itself_lets_paths_leave_there() -> None:
         lambda x, y: [np.where(x < 1, 1.0, -1.0), -y], states=["x", "y"], diffusion=[[0.0], [0.5]]
     )
     problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2.0)
-    setting = setting_of(problem)
+    setting = stages_of(problem)[0]
     side = Side(setting, np.full(2, 0.2), 8, True)
     assert face_of(side.axes, setting.drift, False, 0, 1, 1.0).leaves.all()
     assert not face_of(side.axes, setting.drift, False, 0, 0, 1.0).leaves.any()
@@ -159,7 +159,7 @@ def test_a_drift_that_turns_on_the_face_itself_lets_paths_leave_there() -> None:
 def test_the_steps_cover_the_horizon_from_above_and_stay_within_it_from_below(above: bool) -> None:
     from fractions import Fraction
 
-    setting = setting_of(two_independent()[0])
+    setting = stages_of(two_independent()[0])[0]
     for horizon in (0.3, 0.7, 1.1, 2.0, 1e-5, 37.7):
         side = Side(replace(setting, horizon=horizon), np.full(2, 0.2), 13, above)
         total = sum(map(Fraction, side.steps.tolist()))

@@ -10,7 +10,7 @@ import certbound as cb
 from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.values.kolmogorov import bound_failing
-from certbound.values.kolmogorov.box_setting import Setting, setting_of
+from certbound.values.kolmogorov.box_setting import Setting, stages_of
 from certbound.values.kolmogorov.carry import Side, knots_of
 from certbound.values.kolmogorov.door import refined, starts_in
 from certbound.values.kolmogorov.factors import HALF, clock_breaks, disturbance_nodes, factor_of
@@ -63,7 +63,7 @@ def test_time_inside_of_a_function_of_the_state_is_no_product_and_refused_in_wor
     assert separated(moving.dynamics, 2) is None
     asked = cb.Problem(moving, initial=[0.5, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1)
     with pytest.raises(InfeasibleError, match="as factors of functions of the state"):
-        setting_of(asked)
+        stages_of(asked)[0]
 
 
 def of_time(text: object, disturbance: cb.Box | None = None):
@@ -153,7 +153,7 @@ def test_the_residual_of_a_random_function_lies_below_its_bound_at_all_times(nam
     def noise(t, x):
         return [[0.4 + 0.1 * np.sin(4 * t) * x[0], 0.0], [0.2, 0.3 * np.exp(-t)]]
 
-    setting = setting_of(problem(name, noise))
+    setting = stages_of(problem(name, noise))[0]
     side = Side(setting, np.full(2, 0.3), 6, above)
     shape = (len(side.steps) + 1, *(axis.cells + 5 for axis in side.axes))
     side.values, side.rates = list(rng.normal(size=shape)), list(rng.normal(size=shape))
@@ -230,7 +230,7 @@ TIMED = {
 @pytest.mark.parametrize(("name", "disturbed"), [("swinging", False), ("switched", False), ("swinging", True)])
 def test_two_states_apart_fail_as_often_as_the_bounds_say(name: str, disturbed: bool, above: bool) -> None:
     asked, truth = two_apart(TIMED[name], disturbed)
-    side = Side(setting_of(asked), np.full(2, 0.06), 30, above)
+    side = Side(stages_of(asked)[0], np.full(2, 0.06), 30, above)
     side.propose()
     bound, _, _ = refined(side, starts_in(asked))
     if above:
@@ -253,7 +253,7 @@ def test_the_bounds_are_close_where_there_is_time(name: str, disturbed: bool) ->
 @pytest.mark.parametrize("wrong", ["noise", "half", "policy"])
 def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -> None:
     asked, truth = two_apart(TIMED["swinging"], True)
-    setting, rng = setting_of(asked), np.random.default_rng(7)
+    setting, rng = stages_of(asked)[0], np.random.default_rng(7)
     side = Side(setting, np.full(2, 0.1), 12, above)
     if wrong == "policy":  # the disturbances that do least
         side._worst = lambda mesh, time, a: np.zeros(mesh.equation.shape, dtype=np.intp)
@@ -276,7 +276,7 @@ def test_a_face_that_paths_can_leave_through_for_some_time_or_disturbance_only_i
     ):
         moved = cb.ContinuousSystem(text, states=2, diffusion=[[0.0], [0.5]], **box)
         asked = cb.Problem(moved, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2.0)
-        side = Side(setting_of(asked), np.full(2, 0.2), 8, True)
+        side = Side(stages_of(asked)[0], np.full(2, 0.2), 8, True)
         upper = next(face for face in side.faces if (face.axis, face.side) == (0, 1))
         if box:
             assert upper.leaves.all()
@@ -290,7 +290,7 @@ def test_a_root_that_no_factor_shows_is_refused_where_it_is_undefined() -> None:
         lambda t, x: [-x[0], -x[1]], states=2, diffusion=lambda t, x: [[np.sqrt(x[0]) * (1 + t), 0.0], [0.0, 0.5]]
     )
     asked = cb.Problem(rooted, initial=[0.5, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1.0)
-    setting = setting_of(asked)
+    setting = stages_of(asked)[0]
     assert isinstance(setting, Setting)
     with pytest.raises(EnclosureError, match="undefined"):
         Side(setting, np.full(2, 0.2), 8, True)
@@ -302,11 +302,11 @@ def test_no_lower_bound_is_said_of_unknown_constants_or_of_disturbances_where_th
         lambda x, d: [np.where(x[0] < 0.1, 0.4, -0.4) + d[0], -x[1]], states=2, diffusion=0.5 * np.eye(2),
         disturbance=cb.Box([-0.3], [0.3]),
     )  # fmt: skip
-    assert setting_of(cb.Problem(torn, initial=[0, 0], safe=stay, horizon=2.0)).torn
+    assert stages_of(cb.Problem(torn, initial=[0, 0], safe=stay, horizon=2.0))[0].torn
     smooth = cb.ContinuousSystem(
         lambda x, d: [d[0] - x[0], -x[1]], states=2, diffusion=0.5 * np.eye(2), disturbance=cb.Box([-0.3], [0.3])
     )
     worst = cb.Problem(smooth, initial=[0.6, 0], safe=stay, horizon=1.0)
-    assert not setting_of(worst).torn
+    assert not stages_of(worst)[0].torn
     for asked in (worst.replace(unknown=["d"]), worst.replace(system=torn, horizon=0.5)):
         assert all(found.lower == 0 for found in bound_failing(asked, seconds=1.5))

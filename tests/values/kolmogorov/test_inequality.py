@@ -8,7 +8,7 @@ import pytest
 import certbound as cb
 from certbound.errors import EnclosureError
 from certbound.rigor.intervals import Interval
-from certbound.values.kolmogorov.box_setting import setting_of
+from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.cell_fields import Fields
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.splines import Axis, Derivatives, Sampling, most_on_cells
@@ -172,7 +172,7 @@ def test_settings_that_are_not_served_are_refused_by_name() -> None:
     for words, system in cases.items():
         problem = cb.Problem(system, initial=[0, 0], safe=stay, horizon=1 if words != "discrete" else 5)
         with pytest.raises(InfeasibleError, match=words):
-            setting_of(problem)
+            stages_of(problem)[0]
 
 
 def test_a_hump_that_no_line_of_the_lattice_shows_is_bounded_in_three_states() -> None:

@@ -10,7 +10,7 @@ import pytest
 import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.values.kolmogorov import start_law
-from certbound.values.kolmogorov.box_setting import setting_of
+from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import refined, starts_in
 from certbound.values.kolmogorov.splines import Axis, Sampling
@@ -105,7 +105,7 @@ def two_apart(covariance: list[float]) -> tuple[cb.Problem, float]:
 @pytest.mark.parametrize("wrong", [False, True])
 def test_a_random_start_fails_as_often_as_the_bounds_say_whatever_is_proposed(above: bool, wrong: bool) -> None:
     asked, truth = two_apart([0.04, 0.09])
-    side = Side(setting_of(asked), np.full(2, 0.06), 30, above)
+    side = Side(stages_of(asked)[0], np.full(2, 0.06), 30, above)
     side.propose()
     if wrong:
         rng = np.random.default_rng(0)

@@ -125,6 +125,7 @@ def _shapes(side: Side, due: list[Array]) -> list[Shape]:
         for _ in range(_SETTLED):  # neither changes the number of cells, nor one cell by much
             sizes = np.clip(sizes * float((width / sizes).sum()) / axis.cells, width / _FINER, width * _WIDER)
         sizes = np.min(sizes + _STEEPEST * np.abs(middle[:, None] - middle), axis=1)
+        sizes *= float((width / sizes).sum()) / axis.cells
         wholes.append(float((constant * width * sizes**_POWER).sum()))
         shapes.append(Shape(places=middle, sizes=sizes))
     usual = np.exp(np.mean(np.log(np.maximum(wholes, 1e-300))))

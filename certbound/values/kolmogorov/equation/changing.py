@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from certbound.arrays import Array, Mask
-from certbound.values.kolmogorov.solve import (
+from certbound.values.kolmogorov.equation.solve import (
     CENTRAL,
     NOISE,
     SPLIT_DIAGONAL,

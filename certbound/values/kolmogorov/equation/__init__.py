@@ -1,0 +1,9 @@
+"""The backward equation and its sources in floats: nothing here is trusted."""
+
+from __future__ import annotations
+
+from certbound.values.kolmogorov.equation.changing import ChangingEquation
+from certbound.values.kolmogorov.equation.solve import Discretised, discretised
+from certbound.values.kolmogorov.equation.sources import BREADTHS, at_knots, at_nodes
+
+__all__ = ["BREADTHS", "ChangingEquation", "Discretised", "at_knots", "at_nodes", "discretised"]

@@ -1,0 +1,98 @@
+"""Shares of the carried error by place, axes that follow them, and sources that pay for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.values.kolmogorov.box_setting import stages_of
+from certbound.values.kolmogorov.carry import Side
+from certbound.values.kolmogorov.door import adapted, starts_in
+from certbound.values.kolmogorov.equation.solve import Equation, SplitEquation
+from certbound.values.kolmogorov.equation.sources import Breadth, at_knots, at_nodes
+from certbound.values.kolmogorov.error_shares import better_shapes, shares
+from certbound.values.kolmogorov.splines import cells_of
+
+
+def near_one_limit() -> cb.Problem:
+    """Noise leads paths through one limit only: all the rest is smooth."""
+    system = cb.ContinuousSystem(
+        lambda x, y: [-x, x - y], states=["x", "y"], diffusion=[[0.4, 0.0], [0.0, 0.4]]
+    )
+    return cb.Problem(system, initial=[0.5, 0.0], safe=[cb.Inside(cb.Box([-3, -3], [1, 3]))], horizon=2.0)
+
+
+def proposed(above: bool) -> Side:
+    side = Side(stages_of(near_one_limit())[0], np.full(2, 0.08), 12, above)
+    side.propose()
+    return side
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_shares_add_up_to_what_is_carried_to_the_start(above: bool) -> None:
+    side, starts = proposed(above), starts_in(near_one_limit())
+    residuals = side.residuals(rough=True)
+    total = sum(float(one.sum()) for one in shares(side, residuals, starts.places))
+    equation = side.carrier.equation
+    e = np.zeros(equation.shape)
+    for residual, step in zip(residuals, side.steps):
+        e = equation.solve(step, e + step * at_nodes(residual, side.carrier.pad, Breadth.MEAN) * equation.live)
+    place = tuple(int(np.abs(line - y).argmin()) for line, y in zip(side.carrier.nodes, [0.5, 0.0]))
+    assert total == pytest.approx(float(e[place]), rel=0.25)
+
+
+def test_as_many_cells_leave_less_error_where_axes_follow_the_shares() -> None:
+    side, starts = proposed(above=False), starts_in(near_one_limit())
+    before = sum(float(one.sum()) for one in shares(side, side.residuals(), starts.places))
+    better, _ = adapted(side, starts, 2)
+    after = sum(float(one.sum()) for one in shares(better, better.residuals(), starts.places))
+    assert np.prod(cells_of(better.axes)) < 1.2 * np.prod(cells_of(side.axes))
+    assert after < 0.5 * before
+
+
+def test_cells_change_by_no_more_than_shares_tell() -> None:
+    side, starts = proposed(above=True), starts_in(near_one_limit())
+    for axis, shape in zip(side.axes, better_shapes(side, side.residuals(rough=True), starts.places)):
+        change = shape(shape.places) / axis.widths
+        assert change.max() < 4
+        assert np.abs(np.diff(shape.sizes) / np.diff(shape.places)).max() < 0.3 * 3
+
+
+@pytest.mark.parametrize(("kind", "n"), [(Equation, 2), (SplitEquation, 2), (SplitEquation, 3)])
+def test_the_adjoint_is_the_transpose(kind: type[Equation] | type[SplitEquation], n: int) -> None:
+    rng = np.random.default_rng(0)
+    nodes = [np.sort(rng.uniform(-1, 1, 9 + k)) for k in range(n)]
+    shape = tuple(map(len, nodes))
+    flow, noise = rng.normal(size=(n, *shape)), rng.uniform(0.1, 1, size=(n, *shape))
+    spread = np.zeros((n, n, *shape))
+    for k in range(n):
+        spread[k, k] = noise[k]
+    dead = np.zeros(shape, dtype=bool)
+    dead[0] = True
+    equation = kind(nodes, flow, spread, dead, rng.uniform(0, 1, shape))
+    x, y = rng.normal(size=shape), rng.normal(size=shape)
+    assert np.vdot(equation.adjoint(0.01, x), y) == pytest.approx(np.vdot(x, equation.solve(0.01, y)), rel=1e-9)
+
+
+@pytest.mark.parametrize("pads", [((0, 0), (0, 0)), ((9, 5), (0, 3))])
+def test_sources_are_above_what_is_asked_for_or_as_much_in_the_mean(pads: tuple[tuple[int, int], ...]) -> None:
+    rng = np.random.default_rng(1)
+    cells = rng.exponential(size=(12, 10)) ** 3
+    cells[[0, -1]] = cells[:, [0, -1]] = 0.0
+    (before, behind), (left, right) = pads
+    above = at_nodes(cells, pads, Breadth.ABOVE)
+    assert above.shape == (12 + before + behind + 1, 10 + left + right + 1)
+    corners = np.minimum(np.minimum(above[1:, 1:], above[:-1, 1:]), np.minimum(above[1:, :-1], above[:-1, :-1]))
+    inner = corners[before : before + 12, left : left + 10]
+    assert np.all(inner >= cells * (1 - 1e-12))
+    mean = at_nodes(cells, pads, Breadth.MEAN)
+    assert mean.sum() == pytest.approx(cells.sum(), rel=0.02)
+    largest = at_nodes(cells, pads, Breadth.LARGEST)
+    assert mean.sum() < largest.sum() < above.sum()
+
+
+def test_sources_are_continuous_in_time() -> None:
+    slabs, steps = [np.array([1.0]), np.array([4.0]), np.array([2.0])], np.array([1.0, 1.0, 2.0])
+    assert [float(one[0]) for one in at_knots(slabs, steps, Breadth.ABOVE)] == [1, 4, 4, 2]
+    assert [float(one[0]) for one in at_knots(slabs, steps, Breadth.MEAN)] == [1, 2.5, (4 + 2 * 2) / 3, 2]
