@@ -33,7 +33,7 @@ _GRANT = 0.7  # of the time that is left, where all of it may be spent: what doe
 _LEAST = 1e-3
 _FLOOR = -300.0
 _BACKWARD = 20.0  # of work, where it is asked alone
-_BRIEF = 0.4  # of that, where it is asked among others: for all of it, from the beginning, once they prove nothing
+_BRIEF = 0.4  # of that, where it is asked among others: for the rest once they prove nothing
 _RATIO, _RATIO_WITH_EFFORT = 1.05, 1.0001  # of the two bounds below which grids are not refined
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
@@ -262,12 +262,15 @@ def backward_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer
     """
     if asked.quick:
         return EngineAnswer(applicable=False, method="backward", reason=SPARED)
-    from certbound.values.kolmogorov import bound_failing
+    from certbound.values.kolmogorov import Bounds, bound_failing
 
     effort = asked.effort if asked.effort is not None else 1.0 if asked.thorough else _BRIEF
     answer = EngineAnswer(applicable=False, method="backward")
     try:
-        for found in bound_failing(problem, seconds=effort * _BACKWARD, delta=problem.delta):
+        before = asked.before if isinstance(asked.before, Bounds) else None
+        if before is not None:
+            answer = _carried(problem, before)
+        for found in bound_failing(problem, seconds=effort * _BACKWARD, delta=problem.delta, before=before):
             answer = _carried(problem, found)
             asked.found(answer)
     except (InfeasibleError, EnclosureError) as error:

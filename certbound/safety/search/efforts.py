@@ -3,7 +3,8 @@
 An effort is a multiple of the work that an engine does where it is asked alone. Every engine that left something out
 is asked with effort 1 first, the one with the smallest bound before the others. After that engines whose bounds fall
 with their effort are asked with more and more of it, in turn, each with as much as the time that is left allows at its
-own pace. An engine is exhausted once it comes to its end with more effort and neither proves nor does more than before.
+own pace. An engine is exhausted once it comes to its end with eight times the effort and neither proves nor does more
+than before: less than that may be too little for the next grid.
 """
 
 from __future__ import annotations
@@ -89,9 +90,10 @@ class Standing:
         if not self.refines:
             return True
         ended = [turn for turn in self.turns if turn.ended]
-        if len(ended) < 2:
+        earlier = [turn for turn in ended if turn.effort * _GROWTH[1] <= ended[-1].effort * (1 + 1e-9)]
+        if not earlier:
             return False
-        before, after = ended[-2:]
+        before, after = earlier[-1], ended[-1]
         moved = before.log10_delta - after.log10_delta > _GAIN or after.log10_lower - before.log10_lower > _GAIN
         return not moved and after.seconds <= _AS_LONG[0] * before.seconds + _AS_LONG[1]
 

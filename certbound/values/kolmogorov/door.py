@@ -57,6 +57,8 @@ class Bounds:
         Cells of space and time that passes went over.
     witnesses : tuple of Witness
         What proves the bounds, from coarse to fine: for certificates.
+    search : Search, optional
+        What goes on from here.
     """
 
     lower: float
@@ -67,9 +69,12 @@ class Bounds:
     estimate: float
     work: float
     witnesses: tuple[Witness, ...] = ()
+    search: Search | None = None
 
 
-def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0) -> Iterator[Bounds]:
+def bound_failing(
+    problem: Problem, *, seconds: float = 20.0, delta: float = 0.0, before: Bounds | None = None
+) -> Iterator[Bounds]:  # fmt: skip
     """Bound P(X_t leaves the safe set for some t <= T) from both sides, on finer and finer grids (Thm K10).
 
     Parameters
@@ -77,11 +82,13 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     problem : Problem
         Continuous time, two or three states, limits along the coordinates, each in a window of its own; any noise.
     seconds : float
-        How long to refine, in units of work (`RATE`): the bounds do not depend on the machine or its load. Nothing is
-        proved where the coarsest grid takes more.
+        How long to refine, in units of work (`RATE`), with what was done ``before``: the bounds do not depend on the
+        machine or its load. Nothing is proved where the coarsest grid takes more.
     delta : float
         Where the numerical solution says on which side of ``delta`` the answer lies, only the bound that shows it is
         looked for; 0 for both.
+    before : Bounds, optional
+        What was found of the same problem with less work: the search goes on from there.
 
     Yields
     ------
@@ -95,60 +102,111 @@ def bound_failing(problem: Problem, *, seconds: float = 20.0, delta: float = 0.0
     EnclosureError
         The model is undefined somewhere in the safe set.
     """
-    stages = stages_of(problem)
-    setting = stages[0]
-    if setting.dimension not in _COARSEST:
+    known = None if before is None else before.search
+    search = known if known is not None and known.problem is problem and known.delta == delta else None
+    yield from (search or Search(problem, delta)).until(seconds * RATE[_dimension(problem)])
+
+
+def _dimension(problem: Problem) -> int:
+    if problem.system.dimension not in _COARSEST:
         raise InfeasibleError("values with a carried error serve two and three states here.")
-    starts, cell = starts_in(problem), _COARSEST[setting.dimension]
-    budget = seconds * RATE[setting.dimension]
-    lower, upper, work, runs = 0.0, 1.0, 0.0, 0
-    only = bool(problem.unknown) or setting.torn  # constants are no worst disturbance
-    sides: tuple[bool, ...] = (True,) if only else (True, False)
-    shapes: dict[bool, Shapes] = {}
-    kept: tuple[Witness, ...] = ()
-    while True:
-        before, count, runs = work, math.ceil(_STEPS / cell), runs + 1
-        for above in sides:
-            side = side_of(stages, cell, count, above, _scaled(shapes.get(above), cell))
-            cells = cells_of(side.axes)
-            if not work and len(sides) * _USUAL * side.work > budget:
-                yield Bounds(lower=0.0, upper=1.0, cells=cells, steps=count, runs=0, estimate=math.nan, work=0.0)
+    return problem.system.dimension
+
+
+class Search:
+    """Grids that get finer, and the bounds that they prove.
+
+    Parameters
+    ----------
+    problem : Problem
+    delta : float
+        As of `bound_failing`.
+    """
+
+    def __init__(self, problem: Problem, delta: float) -> None:
+        self.problem, self.delta = problem, delta
+        self.stages = stages_of(problem)
+        self.setting = self.stages[0]
+        self.starts, self.cell = starts_in(problem), _COARSEST[_dimension(problem)]
+        self.lower, self.upper, self.work, self.cost, self.runs = 0.0, 1.0, 0.0, 0.0, 0
+        self.only = bool(problem.unknown) or self.setting.torn  # constants are no worst disturbance
+        self.sides: tuple[bool, ...] = (True,) if self.only else (True, False)
+        self.shapes: dict[bool, Shapes] = {}
+        self.kept: tuple[Witness, ...] = ()
+        self.estimate, self.carried = math.nan, 0.0
+
+    def decided(self) -> bool:
+        """Whether the bounds are near each other, or one of them has passed the target."""
+        return self.upper <= max(_CLOSE * self.lower, self.delta) or self.lower > self.delta > 0
+
+    def until(self, budget: float) -> Iterator[Bounds]:
+        """Bounds, until so much work is done in all."""
+        while not self.decided():
+            if self.cost and not self._finer(budget):
                 return
-            for stage in side.stages[::-1]:
-                stage.propose()
-            estimate = abs(largest_at_start(side, starts)[0])
-            if above and len(sides) > 1 and estimate > _FAR * delta > 0:
-                continue
-            rounds = 0 if above in shapes or side.later is not None else _ROUNDS
-            side, residuals = adapted(side, starts, rounds)
-            cells, estimate = cells_of(side.axes), abs(largest_at_start(side, starts)[0])
-            last = (1 + _LEAST) * _USUAL * side.work > budget - work
-            target = math.inf if last or not delta else delta if above else -delta
-            if residuals is not None:
-                shapes[above] = (cell, better_shapes(side, residuals, starts.places))
-            bound, value, passes = refined(side, starts, target, residuals)
-            work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
-            kept += () if setting.changing or setting.staged or starts.means else Witness.of(side)
-            lower, upper = (lower, min(upper, bound)) if above else (max(lower, -bound), upper)
-            yield Bounds(
-                lower=lower, upper=upper, cells=cells, steps=count, runs=runs, estimate=estimate, work=work,
-                witnesses=kept,
-            )  # fmt: skip
-            if upper <= max(_CLOSE * lower, delta) or lower > delta > 0:
-                return
-            if above and _FAR * estimate < delta:
-                sides = (True,)
-                break
-        growth = min(_GROWTH, (budget - work) / (work - before))
+            begun, self.runs = self.work, self.runs + 1
+            for above in self.sides:
+                side = self._side(above)
+                if not self.work and len(self.sides) * _USUAL * side.work > budget:
+                    yield self._bounds(side, proved=False)
+                    return
+                for stage in side.stages[::-1]:
+                    stage.propose()
+                self.estimate = abs(largest_at_start(side, self.starts)[0])
+                if above and len(self.sides) > 1 and self.estimate > _FAR * self.delta > 0:
+                    continue
+                side = self._refined(side, budget)
+                self.cost = self.work - begun
+                yield self._bounds(side)
+                if self.decided():
+                    return
+                if above and _FAR * self.estimate < self.delta:
+                    self.sides = (True,)
+                    break
+
+    def _side(self, above: bool) -> Side:
+        count = math.ceil(_STEPS / self.cell)
+        return side_of(self.stages, self.cell, count, above, _scaled(self.shapes.get(above), self.cell))
+
+    def _refined(self, side: Side, budget: float) -> Side:
+        """Prove a bound on one grid, after better axes; the side on these."""
+        above, setting = side.above, self.setting
+        rounds = 0 if above in self.shapes or side.later is not None else _ROUNDS
+        side, residuals = adapted(side, self.starts, rounds)
+        self.estimate = abs(largest_at_start(side, self.starts)[0])
+        last = (1 + _LEAST) * _USUAL * side.work > budget - self.work
+        target = math.inf if last or not self.delta else self.delta if above else -self.delta
+        if residuals is not None:
+            self.shapes[above] = (self.cell, better_shapes(side, residuals, self.starts.places))
+        bound, value, passes = refined(side, self.starts, target, residuals)
+        self.work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
+        self.kept += () if setting.changing or setting.staged or self.starts.means else Witness.of(side)
+        self.carried = abs(abs(value) - self.estimate)
+        if above:
+            self.upper = min(self.upper, bound)
+        else:
+            self.lower = max(self.lower, -bound)
+        return side
+
+    def _finer(self, budget: float) -> bool:
+        """Choose the next grid by the work that is left; False where that is too little for one that is worth it."""
+        dimension, delta = self.setting.dimension, self.delta
+        growth = min(_GROWTH, (budget - self.work) / self.cost)
         if growth < _LEAST:
-            return
+            return False
         if delta > 0:
-            carried, room = abs(abs(value) - estimate), _SHARE * abs(delta - estimate)
-            needed = (carried / max(room, 1e-300)) ** ((setting.dimension + 1) / _ORDER)
-            growth = max(min(growth, needed), _LEAST)
-            growth = min(growth * len(sides), _GROWTH)
-            sides = (estimate < delta or only,)
-        cell /= growth ** (1 / (setting.dimension + 1))
+            room = _SHARE * abs(delta - self.estimate)
+            needed = (self.carried / max(room, 1e-300)) ** ((dimension + 1) / _ORDER)
+            growth = min(max(min(growth, needed), _LEAST) * len(self.sides), _GROWTH)
+            self.sides = (self.estimate < delta or self.only,)
+        self.cell /= growth ** (1 / (dimension + 1))
+        return True
+
+    def _bounds(self, side: Side, proved: bool = True) -> Bounds:
+        return Bounds(
+            lower=self.lower, upper=self.upper, cells=cells_of(side.axes), steps=math.ceil(_STEPS / self.cell),
+            runs=self.runs if proved else 0, estimate=self.estimate, work=self.work, witnesses=self.kept, search=self,
+        )  # fmt: skip
 
 
 Shapes = tuple[float, list[Shape]]
