@@ -39,8 +39,11 @@ class Cells:
         if self.round is None:
             return bound
         center, form = self.round
+        radius = _round_radius(form, norm)
+        if not np.isfinite(radius):  # of an ellipsoid that is nearly flat
+            return bound
         shift = norm.length(Interval.point(center) - starts)
-        around = Interval.point(_round_radius(form, norm)) + Interval.point(shift)
+        around = Interval.point(radius) + Interval.point(shift)
         return np.asarray(np.minimum(bound, around.hi))
 
 
