@@ -164,3 +164,14 @@ def test_the_steps_cover_the_horizon_from_above_and_stay_within_it_from_below(ab
         side = Side(replace(setting, horizon=horizon), np.full(2, 0.2), 13, above)
         total = sum(map(Fraction, side.steps.tolist()))
         assert total >= Fraction(horizon) if above else total <= Fraction(horizon)
+
+
+def test_a_state_that_rests_has_a_range_of_its_own() -> None:
+    system = cb.ContinuousSystem(
+        lambda x, y: [0 * x, -y], states=["x", "y"], diffusion=[[0.0], [0.5]]
+    )
+    problem = cb.Problem(system, initial=[0.5, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1.0)
+    setting = stages_of(problem)[0]
+    assert np.all(setting.range[0] < setting.range[1])
+    found = last(problem, seconds=0.5)
+    assert found.lower <= 1 - survival(0.5, 0.0, 1.0) <= found.upper
