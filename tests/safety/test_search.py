@@ -105,6 +105,8 @@ def test_an_engine_is_exhausted_once_more_effort_proves_and_does_no_more() -> No
     assert not one.exhausted
     same = replace(first, effort=8.0)
     assert replace(one, turns=(first, same)).exhausted
+    less = replace(same, effort=7.9 * first.effort)  # may be too little for a finer grid
+    assert not replace(one, turns=(first, less)).exhausted
     assert not replace(one, turns=(first, replace(same, seconds=30.0))).exhausted  # it works on something
     assert not replace(one, turns=(first, replace(same, log10_lower=-2.0))).exhausted
     assert not replace(one, turns=(first, same, replace(same, ended=False))).exhausted  # time ended it

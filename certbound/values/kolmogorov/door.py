@@ -307,7 +307,7 @@ def _settled(side: Side, enough: float) -> float:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Starts:
-    """Boxes around the starts, points that surely are starts, shapes (S, n) and (P, n), and normal starts."""
+    """Boxes around the starts, points that are proved to be starts, shapes (S, n) and (P, n), and normal starts."""
 
     low: Array
     high: Array

@@ -175,3 +175,16 @@ def test_a_state_that_rests_has_a_range_of_its_own() -> None:
     assert np.all(setting.range[0] < setting.range[1])
     found = last(problem, seconds=0.5)
     assert found.lower <= 1 - survival(0.5, 0.0, 1.0) <= found.upper
+
+
+def test_a_second_search_goes_on_where_the_first_one_ended() -> None:
+    problem, truth = two_independent()
+    first = last(problem, seconds=0.8)
+    assert first.runs >= 1
+    *_, second = bound_failing(problem, seconds=2.5, before=first)
+    assert second.runs > first.runs
+    assert second.work > first.work
+    assert first.lower <= second.lower <= truth <= second.upper <= first.upper
+    assert list(bound_failing(problem, seconds=0.8, before=first)) == []
+    other = next(bound_failing(problem.replace(horizon=1.9), seconds=0.8, before=first))
+    assert other.runs == 1

@@ -3,7 +3,7 @@
 An error that is to be carried costs what its source costs. A source above whatever is asked for, and smooth, costs many
 times more than that where it is needed on a few cells only; one that is about it in the mean leaves less than half of
 it to the next pass, and costs no more than it has to. So the first pass takes means, two more take the larger of
-neighbours, smoothed, and the last ones what surely suffices on every cell.
+neighbours, smoothed, and the last ones what is enough on every cell.
 """
 
 from __future__ import annotations
