@@ -37,6 +37,7 @@ from certbound.problem.sets import (
     Reach,
     Region,
     StartUnion,
+    check_over_time,
     check_start,
     check_target,
 )
@@ -151,6 +152,7 @@ class Problem(Shown):
         assign(self, plan=self._checked_plan())
         assign(self, hold=checked_hold(self.hold, self.plan, self.system, self.horizon))
         assign(self, cost=checked_cost(self.cost, self.system))
+        self._check_sides()
         for member in self.starts:
             check_start(member, self.kept)
         if self.reach is not None:
@@ -325,7 +327,7 @@ class Problem(Shown):
         if self.hold is not None:
             given.append((self.plan, self.samples, "a sampling time"))
         sets = [constraint.region for constraint in (*self.safe, *([self.reach] if self.reach is not None else []))]
-        given += [(getattr(region, "center", None), steps, when) for region in sets]
+        given += [(tape, steps, when) for region in sets for tape in (region.center, *region.sides.values())]
         for tape, samples, when in given:
             found = rounded_comparison(tape, float(steps or self.horizon), samples) if isinstance(tape, Tape) else None
             if found is not None:
@@ -334,6 +336,13 @@ class Problem(Shown):
                     f"side of it at {when} than exact arithmetic does. Compare with one number (t < 0.3, not "
                     "t - 0.1 < 0.2), away from steps and sampling times (t < 8.5, not 0.1*t <= 0.9)."
                 )
+
+    def _check_sides(self) -> None:
+        """Refuse sides that move and describe no set at some time of their window."""
+        named = [(f"safe[{place}]", constraint) for place, constraint in enumerate(self.safe)]
+        for name, constraint in [*named, *([("reach", self.reach)] if self.reach is not None else [])]:
+            window = constraint.during or (0.0, float(self.horizon))
+            check_over_time(name, constraint.region, window, self.system.time == "discrete")
 
     def _constraints(self) -> tuple[Inside, ...]:
         safe = [self.safe] if isinstance(self.safe, Inside) else self.safe

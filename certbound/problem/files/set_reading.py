@@ -12,6 +12,7 @@ from certbound.checks import located
 from certbound.problem import sets
 from certbound.problem.files.reader import Reader
 from certbound.problem.files.schema import Constraint, Part, PolygonTable, Start
+from certbound.problem.model import Tape
 
 
 class SetReader(Reader):
@@ -23,10 +24,24 @@ class SetReader(Reader):
         places = [f"{where}.{k}" for k in range(len(texts))]
         return self.function(texts, ("t",), places, (len(texts),)), coordinates
 
-    def box(self, table: Any, where: str, missing: float | None, center: Any = None) -> sets.Box:
+    def side(self, value: Any, where: str) -> Any:
+        """A number; or the tape of an expression that uses t, which moves a side of a set."""
+        if not isinstance(value, str):
+            return self.number(value, where)
+        tape = self.function([value], ("t",), [where], (1,))
+        return tape if any(node.op == "input" for node in tape.nodes) else self.number(value, where)
+
+    def box(
+        self, table: Any, where: str, missing: float | None, center: Any = None, *, moves: bool = False
+    ) -> sets.Box:
         pairs, coordinates = self.by_state(table, where)
         indices = range(len(self.states)) if coordinates is None else coordinates
-        ends = [self.array(pair, f"{where}.{self.states[k]}") for k, pair in zip(indices, pairs)]
+        names = [f"{where}.{self.states[k]}" for k in indices]
+        if moves:
+            read = [[self.side(end, f"{name}.{k}") for k, end in enumerate(pair)] for name, pair in zip(names, pairs)]
+            if any(isinstance(end, Tape) for pair in read for end in pair):
+                return self.moving_box(read, indices, center)
+        ends = [self.array(pair, name) for name, pair in zip(names, pairs)]
         if missing is None and len(ends) != len(self.states):
             absent = [name for k, name in enumerate(self.states) if k not in indices]
             raise ValueError(f"`{where}` must bound every state, {', '.join(absent)} is missing.")
@@ -36,6 +51,14 @@ class SetReader(Reader):
                 state = self.states[index]
                 got = f"{pair[0]:g} > {pair[1]:g}"
                 raise ValueError(f"`{where}.{state}` must be [low, high], got {got}; swap the two.")
+            low[index], high[index] = pair
+        return sets.Box(low, high, center=center)
+
+    def moving_box(self, pairs: list[list[Any]], indices: Any, center: Any) -> sets.Box:
+        """A box with sides that are functions of t."""
+        low: list[Any] = [-np.inf] * len(self.states)
+        high: list[Any] = [np.inf] * len(self.states)
+        for index, pair in zip(indices, pairs):
             low[index], high[index] = pair
         return sets.Box(low, high, center=center)
 
@@ -98,10 +121,12 @@ class SetReader(Reader):
                 chosen = list(range(len(self.states)) if coordinates is None else coordinates)
                 fields["normal"][chosen] = self.array(values, place)
             elif isinstance(value, list):
-                read = self.matrix if any(isinstance(row, list) for row in value) else self.array
-                fields[name] = read(value, place)
+                if any(isinstance(row, list) for row in value):
+                    fields[name] = self.matrix(value, place)
+                else:
+                    fields[name] = [self.side(entry, f"{place}.{k}") for k, entry in enumerate(value)]
             else:
-                fields[name] = self.number(value, place)
+                fields[name] = self.side(value, place)
         with located(where, fields):
             return _SHAPES[kind](**fields)
 
@@ -155,7 +180,7 @@ class SetReader(Reader):
                 moves = dict(zip(indices, texts))
                 full = [moves.get(k, 0.0) for k in range(len(self.states))]
                 center = self.place(full, f"{where}.center")[0]
-            return self.box(table.box, where, np.inf, center)
+            return self.box(table.box, where, np.inf, center, moves=True)
         return self.shape(getattr(table, table.chosen), table.chosen, where)
 
 

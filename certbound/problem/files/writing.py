@@ -160,7 +160,11 @@ class _Writer:
 
     def intervals(self, box: sets.Box) -> dict[str, Any]:
         used = self.states if box.coordinates is None else [self.states[k] for k in box.coordinates]
-        return {name: [low, high] for name, low, high in zip(used, box.low.tolist(), box.high.tolist())}
+        return {name: [low, high] for name, low, high in zip(used, self.sides(box.low), self.sides(box.high))}
+
+    def sides(self, value: Any) -> list[Any]:
+        """Sides of a set: numbers, and expressions of those that move."""
+        return [self.texts(one)[0] if isinstance(one, Tape) else one for one in sets.entries_of(value)]
 
     def place(self, region: Any) -> dict[str, Any]:
         used = self.states if region.coordinates is None else [self.states[k] for k in region.coordinates]
@@ -175,6 +179,9 @@ class _Writer:
         if kind == "polytope" and region.kind != kind:
             table = self.resting(region)
         written = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in table.items()}
+        for name in written.keys() & region.sides.keys():
+            moved = self.sides(written[name])
+            written[name] = moved if name == "b" else moved[0]
         if "center" in written:
             written["center"] = self.place(region)
         if "normal" in written:

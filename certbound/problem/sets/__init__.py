@@ -6,6 +6,7 @@ from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, R
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 from certbound.problem.sets.initial import check_start, check_target
+from certbound.problem.sets.moving import check_over_time, entries_of
 from certbound.problem.sets.polytopes import intersection, polygon
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.sets.unions import StartUnion
@@ -13,10 +14,12 @@ from certbound.problem.sets.unions import StartUnion
 __all__ = [
     "Ball",
     "Box",
+    "check_over_time",
     "check_start",
     "check_target",
     "clearance",
     "Ellipsoid",
+    "entries_of",
     "Faces",
     "GaussianStart",
     "HalfSpace",

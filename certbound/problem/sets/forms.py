@@ -7,7 +7,7 @@ a shape says better where it knows better.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array, Mask
+from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, arithmetic, compile_numpy
 from certbound.rigor.intervals import Interval, sqrt, stack
 
@@ -134,7 +135,10 @@ class Region:
 
     @cached_property
     def form(self) -> Form:
-        """The set about its centre, in its coordinates."""
+        """The set about its centre, in its coordinates.
+
+        InfeasibleError where its sides move, so that no form is the set's at all times.
+        """
         raise NotImplementedError
 
     @property
@@ -146,8 +150,38 @@ class Region:
 
     @property
     def moving(self) -> bool:
-        """True when the centre is a function of time."""
-        return isinstance(self.center, Tape)
+        """True when the centre, or a side, is a function of time."""
+        return isinstance(self.center, Tape) or self.changing
+
+    @cached_property
+    def sides(self) -> dict[str, Tape]:
+        """The sides, radius or bounds that are functions of time, by their fields' names; the centre is none."""
+        found = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "center"}  # type: ignore[arg-type]  # a shape is a dataclass
+        return {name: value for name, value in found.items() if isinstance(value, Tape)}
+
+    @property
+    def changing(self) -> bool:
+        """True when a side, the radius or a bound is a function of time, so that the set is of another size or shape."""
+        return bool(self.sides)
+
+    def refuse_changing(self) -> None:
+        """InfeasibleError where sides move: who reads the set as one that rests, or that only its centre moves."""
+        if self.changing:
+            raise InfeasibleError(
+                f"sides of a {self.kind} move with t ({', '.join(self.sides)}), which this does not serve: "
+                "verify_safety, bound_exit_times and simulations do; give sides that rest, or move the centre."
+            )
+
+    def at(self, t: float) -> Any:
+        """The set as it is at a time, which rests; its sides and centre are computed in plain floating point.
+
+        ValueError where the sides describe no set then.
+        """
+        sides = {name: compile_numpy(tape)(t) for name, tape in self.sides.items()}
+        numbers = {name: float(value[0]) if name in ("radius", "bound") else value for name, value in sides.items()}
+        if isinstance(self.center, Tape):
+            numbers["center"] = self.center_at(t)
+        return replace(self, **numbers) if numbers else self  # type: ignore[type-var]  # a shape is a dataclass
 
     @property
     def is_point(self) -> bool:
@@ -210,6 +244,8 @@ class Region:
 
     def contains(self, x: ArrayLike, t: float = 0.0) -> Mask:
         """Whether states, shape (..., n), lie in the closed set at time t."""
+        if self.changing:
+            return np.asarray(self.at(t).contains(x))
         return self._holds(self.local(x) - self.center_at(t))
 
     def _holds(self, y: Array) -> Mask:
@@ -231,6 +267,8 @@ class Region:
 
     def local_support(self, directions: Array, t: float) -> Array:
         """`support` along directions of the coordinates that the set bounds."""
+        if self.changing:
+            return np.asarray(self.at(t).local_support(directions, 0.0))
         match self.form:
             case Quadratic() as form:
                 square = np.einsum("...i,...i->...", directions, directions @ form.shape)
@@ -249,6 +287,8 @@ class Region:
 
     def sample(self, rng: np.random.Generator, count: int, t: float = 0.0) -> Array:
         """Uniform random points, shape (count, dimension)."""
+        if self.changing:
+            return np.asarray(self.at(t).sample(rng, count))
         center, eye = self.center_at(t), np.eye(self.dimension)
         if isinstance(self.form, Quadratic):
             points = rng.standard_normal((count, self.dimension))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside], 
     for constraint in constraints:
         if constraint.during is not None and constraint.during[0] > 0:
             continue
+        if constraint.region.changing:
+            constraint = replace(constraint, region=constraint.region.at(0.0))
         with np.errstate(all="ignore"):
             place = constraint.region.center_at()
         if not np.all(np.isfinite(place)):
@@ -53,6 +56,7 @@ def _refuse_touching(initial: Region | GaussianStart, constraints: Sequence[Insi
         region, due = constraint.region, constraint.during is None or constraint.during[0] <= 0
         if not (constraint.outside and due) or initial.random:
             continue
+        region.refuse_changing()
         near = _touches(initial, region, -_ROUNDING * _size(initial, region))
         if near or bool(region.contains(initial.middle)):
             raise InfeasibleError(f"a start touches the edge of '{constraint.label}', where it has failed.")
@@ -61,9 +65,10 @@ def _refuse_touching(initial: Region | GaussianStart, constraints: Sequence[Insi
 def check_target(target: Region, constraints: Sequence[Inside], dimension: int) -> None:
     """Refuse a target that surely lies outside of a constraint that always holds, with a ValueError that names it."""
     for constraint in constraints:
-        form, region = constraint.region.form, constraint.region
-        if not isinstance(form, Faces) or constraint.during is not None or region.moving or target.moving:
+        region = constraint.region
+        if region.moving or target.moving or constraint.during is not None or not isinstance(region.form, Faces):
             continue
+        form = region.form
         rows = region.lifted(form.normals, dimension)
         bounds = form.bounds + form.normals @ region.center_at()
         slack = _SLACK * (1 + np.abs(bounds))
