@@ -12,7 +12,7 @@ its least value between them (an error of fourth order in the step), where an os
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,8 +38,10 @@ class Barrier:
     stay: bool  # True: inside the region; False: outside it
     round: bool  # True: the region is {‖matrix x - offset‖ <= radius}; False: it is {matrix x <= offset}
     matrix: Array  # (rows, n)
-    offset: Array  # (rows,) or (steps + 1, rows): the second shape: one row per step, for a region that moves
-    radius: float = 0.0
+    # (rows,) or (steps + 1, rows): the second shape: one row per step, for a region that moves. Where the radius moves
+    # its values stand in a last column
+    offset: Array
+    radius: float | None = 0.0  # None: in the last column of ``offset``
     first: int
     last: int
     always: bool = False  # whether these are all steps: then the kernel asks no further
@@ -48,6 +50,11 @@ class Barrier:
     def moving(self) -> bool:
         """Whether the region depends on time."""
         return self.offset.ndim == 2
+
+    @property
+    def columns(self) -> int:
+        """Columns of the table of what moves that it reads."""
+        return self.offset.shape[1] if self.moving else 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -137,7 +144,15 @@ def _watched(problem: Any, constraints: Sequence[Inside], times: Array) -> list[
             first = end = int(np.argmin(np.abs(times - 0.5 * (start + stop))))
         embed = np.eye(problem.system.dimension)[region.places(problem.system.dimension)]
         centers = np.array([region.center_at(t) for t in times]) if region.moving else region.center_at()
-        match region.form:
+        window = (min(first, last), min(end, last))
+        match region.at(float(times[window[0]])).form if region.changing else region.form:
+            case Quadratic() as form if region.changing:
+                radii = _over_window(times, window, lambda t, region=region: region.at(t).form.radius)
+                fields = _round_fields(form, embed, centers, np.asarray(radii))
+            case Faces() as form if region.changing and len(form.bounds):
+                bounds = _over_window(times, window, lambda t, region=region: region.at(t).form.bounds)
+                offset = bounds + centers @ form.normals.T
+                fields = {"round": False, "matrix": form.normals @ embed, "offset": offset}
             case Quadratic() as form:
                 fields = _round_fields(form, embed, centers)
             case Faces() as form if len(form.bounds):
@@ -146,9 +161,16 @@ def _watched(problem: Any, constraints: Sequence[Inside], times: Array) -> list[
             case _:
                 continue
         fields |= {"label": constraint.label, "stay": not constraint.outside}
-        fields |= {"first": min(first, last), "last": min(end, last), "always": first == 0 and end >= last}
+        fields |= {"first": window[0], "last": window[1], "always": first == 0 and end >= last}
         barriers.append(Barrier(**fields))
     return barriers
+
+
+def _over_window(times: Array, window: tuple[int, int], sides: Callable[[float], Any]) -> Array:
+    """Sides at all times, as they are in a window; beyond it, where nothing asks for them, those of its ends."""
+    first, last = window
+    inside = [sides(float(t)) for t in times[first : last + 1]]
+    return np.array([*[inside[0]] * first, *inside, *[inside[-1]] * (len(times) - 1 - last)], dtype=float)
 
 
 def tables_of(barriers: Sequence[Barrier]) -> dict[str, Any]:
@@ -160,13 +182,20 @@ def tables_of(barriers: Sequence[Barrier]) -> dict[str, Any]:
     }
 
 
-def _round_fields(form: Quadratic, embed: Array, centers: Array) -> dict[str, Any]:
-    """A ball or ellipsoid as ‖matrix x - offset‖ <= radius; an interval, in one dimension, as two faces."""
+def _round_fields(form: Quadratic, embed: Array, centers: Array, radii: Array | None = None) -> dict[str, Any]:
+    """A ball or ellipsoid as ‖matrix x - offset‖ <= radius; an interval, in one dimension, as two faces.
+
+    ``radii``, one a step, are those of a ball whose radius moves.
+    """
     root, radius = form.test
     matrix, offset = root @ embed, centers @ root.T
     if form.dimension == 1:
-        both = np.concatenate([radius + offset, radius - offset], axis=-1)
+        size = radius if radii is None else radii[:, None]
+        both = np.concatenate([size + offset, size - offset], axis=-1)
         return {"round": False, "matrix": np.vstack([matrix, -matrix]), "offset": both}
+    if radii is not None:
+        columns = np.column_stack([np.broadcast_to(offset, (len(radii), len(matrix))), radii])
+        return {"round": True, "matrix": matrix, "offset": columns, "radius": None}
     return {"round": True, "matrix": matrix, "offset": offset, "radius": radius}
 
 
@@ -339,7 +368,11 @@ def _round(
 ) -> tuple[list[str], list[str], list[str]]:
     rows, dimension = barrier.matrix.shape
     old, new = f"q_{number}", f"r_{number}"
-    radius = p.add(barrier.radius)
+    moved = f"{column + rows}]"  # where a radius that moves stands
+    first, before, radius = (
+        [f"moving[{step}, {moved}" for step in ("0", "k", "k + 1")] if barrier.radius is None
+        else [p.add(barrier.radius)] * 3
+    )  # fmt: skip
     legs = vector(f"e_{number}", rows)
 
     def distance(target: str, state: str, step: str) -> list[str]:
@@ -350,23 +383,24 @@ def _round(
             lines += [f"{leg} = {value} - {center}"]
         return [*lines, f"{target} = {' + '.join(f'{leg} * {leg}' for leg in legs)}"]
 
-    beyond = f"{'>' if barrier.stay else '<='} {radius} * {radius}"
+    beyond = ">" if barrier.stay else "<="
     start = distance(old, "x", "0")
-    start += [if_all(starts_at_once(number, barrier), f"{old} {beyond}"), f"    left = {number}"]
+    start += [if_all(starts_at_once(number, barrier), f"{old} {beyond} {first} * {first}"), f"    left = {number}"]
     step = distance(new, "y", "k + 1")
-    step += [if_all(f"{new} {beyond}", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
+    step += [if_all(f"{new} {beyond} {radius} * {radius}", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
     end = [f"{old} = {new}"]
     if bridge is None:
         return start, step, []
     if bridge.smooth(barrier.matrix):
         older, gap, after = f"o_{number}", f"g_{number}", f"n_{number}"
         sign = "-" if barrier.stay else ""
-        step += [f"{gap}, {after} = {sign}({old} - {radius} * {radius}), {sign}({new} - {radius} * {radius})"]
+        step += [f"{gap}, {after} = {sign}({old} - {before} * {before}), {sign}({new} - {radius} * {radius})"]
         step += _turn(older, gap, after, number, barrier)
         return [*start, f"{older} = math.nan"], step, [f"{older} = {gap}", *end]
     near = _near(barrier, bridge, old, new, p)
-    gap = f"{radius} - math.sqrt({{0}})" if barrier.stay else f"math.sqrt({{0}}) - {radius}"
-    lines = [f"before, after = {gap.format(old)}, {gap.format(new)}"]
+    sides = [(before, f"math.sqrt({old})"), (radius, f"math.sqrt({new})")]
+    gaps = [f"{size} - {place}" if barrier.stay else f"{place} - {size}" for size, place in sides]
+    lines = [f"before, after = {gaps[0]}, {gaps[1]}"]
     weights = [linear_form(column_.tolist(), legs, p) for column_ in barrier.matrix.T]
     lines += [f"w_{i} = {weight}" for i, weight in enumerate(weights)]
     spread = bridge.moving_variance(vector("w", dimension), p)
@@ -379,7 +413,7 @@ def _round(
 
 def _near(barrier: Barrier, bridge: Bridge, old: str, new: str, p: Parameters) -> str:
     """Test, on squared radii, whether a bridge can matter; none where the noise depends on the state."""
-    if bridge.spread is None:
+    if bridge.spread is None or barrier.radius is None:
         return ""
     band = np.sqrt(0.5 * EXPONENT) * np.linalg.norm(barrier.matrix @ bridge.spread, 2)
     near = max(barrier.radius - band, 0.0) if barrier.stay else barrier.radius + band

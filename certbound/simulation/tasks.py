@@ -68,13 +68,13 @@ def _exits(task: Task, bridge: Bridge | None, p: Parameters) -> Lines:
     for number, barrier in enumerate(task.barriers):
         before, during, after = barrier_source(number, barrier, bridge, p, column)
         begin, within, end = begin + before, within + during, end + after
-        column += len(barrier.matrix) if barrier.moving else 0
+        column += barrier.columns
     if task.goal is not None:
         number = len(task.barriers)
         goal = barrier_source(number, task.goal, bridge, p, column)
         if task.keep is None:
             return _until_goal(number, goal, (begin, within, end))
-        column += len(task.goal.matrix) if task.goal.moving else 0
+        column += task.goal.columns
         keep = barrier_source(number + 1, task.keep, bridge, p, column)
         return _kept_goal(number, goal, keep, (begin, within, end))
     begin += ["if left >= 0:", *indent([*_count("left", "0"), "continue"])]

@@ -56,7 +56,7 @@ def clearance(
     >>> float(clearance(Outside(Ball([0.0, 0.0], 1.0)), [3.0, 4.0]))
     4.0
     """
-    region = constraint.region
+    region = constraint.region.at(t) if constraint.region.changing else constraint.region
     y = region.local(x) - region.center_at(t)
     block = _block(region, np.shape(x)[-1], inverse_metric)
     inside = not constraint.outside

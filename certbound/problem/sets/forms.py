@@ -328,7 +328,7 @@ class Region:
                 return f"{word} a {self.kind or type(self).__name__} of {len(form.bounds)} faces"
 
     def _place(self, states: tuple[str, ...]) -> str:
-        place = "a moving centre" if self.moving else "(" + ", ".join(f"{x:g}" for x in self.center_at()) + ")"
+        place = "a moving centre" if isinstance(self.center, Tape) else "(" + ", ".join(f"{x:g}" for x in self.center_at()) + ")"
         return place if self.coordinates is None else f"{place} in ({', '.join(states[k] for k in self.coordinates)})"
 
     def data(self, kinds: Collection[str]) -> dict[str, Any]:

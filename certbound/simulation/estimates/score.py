@@ -46,7 +46,7 @@ def score_source(
                 end += [f"{older} = {old[unit]}"]
             within += _unit((old[unit], new[unit], free[unit]), (active, bridged), *spread, p)
         end += [f"{g} = {n}" for g, n in zip(old, new)]
-        column += len(barrier.matrix) if barrier.moving else 0
+        column += barrier.columns
     return begin, within, end
 
 
@@ -93,7 +93,8 @@ def _gaps(barrier: Barrier, targets: list[str], state: str, step: str, column: i
         values.append(f"{linear_form(barrier.matrix[i].tolist(), names, p)} - {offset}")
     if barrier.round:
         legs = [f"({value}) ** 2" for value in values]
-        distance, radius = f"math.sqrt({' + '.join(legs)})", p.add(barrier.radius)
+        moved = f"moving[{step}, {column + rows}]"
+        distance, radius = f"math.sqrt({' + '.join(legs)})", moved if barrier.radius is None else p.add(barrier.radius)
         return [f"{targets[0]} = " + (f"{radius} - {distance}" if barrier.stay else f"{distance} - {radius}")]
     if barrier.stay:
         return [f"{target} = -({value})" for target, value in zip(targets, values)]
