@@ -6,7 +6,7 @@ from certbound.problem.sets.constraints import GaussianStart, Inside, Outside, R
 from certbound.problem.sets.distances import clearance
 from certbound.problem.sets.forms import Faces, Quadratic, Region
 from certbound.problem.sets.initial import check_start, check_target
-from certbound.problem.sets.moving import check_over_time, entries_of
+from certbound.problem.sets.moving import check_over_time, entries_of, shifted, stacked
 from certbound.problem.sets.polytopes import intersection, polygon
 from certbound.problem.sets.regions import Ball, Box, Ellipsoid, HalfSpace, Polytope
 from certbound.problem.sets.unions import StartUnion
@@ -31,5 +31,7 @@ __all__ = [
     "Quadratic",
     "Reach",
     "Region",
+    "shifted",
+    "stacked",
     "StartUnion",
 ]
