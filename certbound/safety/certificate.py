@@ -71,6 +71,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    refuse_moving_limits(problem, verdict)
     members, cells = getattr(verdict, "members", ()), getattr(verdict, "cells", ())
     if problem.random and not members:
         if verdict.status == "UNSAFE":
@@ -108,6 +109,19 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
         return _whole(problem, claim, proof)
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
+
+
+def refuse_moving_limits(problem: Problem, verdict: Answered | None = None) -> None:
+    """CertificateError where sides move, or where what was proved speaks of coordinates that move with limits."""
+    asked = [*problem.safe, *([] if problem.reach is None else [problem.reach])]
+    changing = next((one.label for one in asked if one.region.changing), None)
+    if changing is None and getattr(verdict, "stated", None) is None:
+        return
+    what = f" ('{changing}')" if changing else ""
+    raise CertificateError(
+        f"no certificate states limits that move{what}, since the checker does not know the coordinates in which they "
+        "rest; one states centres that move, where the linear response or constants prove enough."
+    )
 
 
 def _stated(cell: Any, attempt: int) -> dict[str, Any] | None:

@@ -26,6 +26,7 @@ from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import arrival, best_time, find_miss, window_of
+from certbound.safety.moving_limits import is_moving, moving_verdict
 from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of, in_order
 from certbound.safety.search import Action, Standing, Turn, next_action
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, undone, unfinished, unsafe, verdict_of
@@ -71,6 +72,19 @@ def decide(
         return worst_verdict(problem, watch, lambda member: decide(member, full=full, **options))
     if problem.random:
         return average_verdict(problem, watch, lambda cell: decide(cell, full=False, **options))
+    if is_moving(problem):
+        return moving_verdict(
+            problem, watch, lambda resting: decide(resting, full=full, **options),
+            lambda plain: _searched(plain, request, names, watch, method, full=False),
+            method=method, stated=constants is not None,
+        )  # fmt: skip
+    return _searched(problem, request, names, watch, method, full=full)
+
+
+def _searched(
+    problem: Problem, request: Request, names: tuple[str, ...], watch: Watch, method: str, *, full: bool
+) -> Verdict:
+    """The verdict on a problem as it is."""
     search = _Search(problem, request, watch, full=full)
     try:
         with search.watch.running():

@@ -68,6 +68,8 @@ class Verdict(Shown):
         What engines answered that only a certificate had to ask, by name: kept, so that none is asked twice.
     cells : tuple of Cell
         Where constants are drawn, the cells of their values over which the bounds were averaged.
+    stated : Problem or None
+        Where limits move, the problem in coordinates in which they rest, of which the answers speak.
     """
 
     pictured: ClassVar[bool] = True
@@ -91,6 +93,7 @@ class Verdict(Shown):
     members: tuple[Verdict, ...] = field(default=(), repr=False)
     reserves: dict[str, EngineAnswer] = field(default_factory=dict, repr=False)
     cells: tuple[Any, ...] = field(default=(), repr=False)
+    stated: Problem | None = field(default=None, repr=False)
 
     @property
     def worst(self) -> Verdict:

@@ -7,7 +7,7 @@ of face and horizon. Below, e^V <= w has to hold on the limit and at the horizon
 elsewhere: what ends there counts at least w, which is subtracted.
 
 Where neither model nor limits depend on time, and nothing disturbs, the start that is farthest from the target is the
-worst: from there a path passes every other one, with less time left.
+worst: from there a path passes every other one, with less time left. A model that depends on time has a single start.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def bound_arrival(
     Raises
     ------
     InfeasibleError
-        Models, limits or targets that depend on time, disturbances, random starts, starts that are not on one side of
+        Limits or targets that depend on time, a model that does with more than one start, disturbances, random starts, starts that are not on one side of
         the target, or a limit between them and it.
     """
     side, start, spread = _placed(problem, model, target)
@@ -120,13 +120,15 @@ def _listed(done: list[str]) -> str:
 
 def _placed(problem: Problem, model: Model, target: Region) -> tuple[int, Start, Start]:
     """The side of the starts on which the target lies, the worst of them rounded outward, and an interval around it."""
-    if not model.autonomous or target.moving or any(c.during is not None for c in problem.constraints):
-        raise InfeasibleError("value functions in continuous time need a target, limits and a model without time.")
+    if target.moving or any(c.during is not None for c in problem.constraints):
+        raise InfeasibleError("value functions in continuous time need a target and limits without time.")
     if problem.system.disturbance is not None:
         raise InfeasibleError("value functions in continuous time do not serve targets under disturbances.")
     if problem.initial.random:
         raise InfeasibleError("value functions in continuous time need a set of starts for a target.")
     start, around = start_of(problem), target.hull()
+    if not model.autonomous and start.low < start.high:
+        raise InfeasibleError("value functions of models that depend on time need a single start for a target.")
     if start.high < around.lo[0]:
         return 1, *start.end(-1)
     if start.low > around.hi[0]:
