@@ -326,6 +326,9 @@ class Polytope(Region):
         self.refuse_changing()
         return Faces(self.A, self.b)
 
+    def describe(self, states: tuple[str, ...], word: str) -> str:
+        return f"{word} a polytope of {len(self.A)} faces"
+
     def grown(self, distance: float) -> Polytope:
         self.refuse_changing()
         return replace(self, b=self.b + distance * np.linalg.norm(self.A, axis=1))
