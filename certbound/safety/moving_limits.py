@@ -77,7 +77,7 @@ def _at_rest(problem: Problem, resting: RestingLimits, watch: Watch, decided: De
     below = _said_of(problem, resting, decided(resting.below))
     if not below.status.startswith("UNSAFE"):
         return replace(found, log10_lower=below.log10_lower)
-    return replace(below, log10_delta=found.log10_delta)
+    return replace(below, log10_delta=found.log10_delta, answers=found.answers, stated=found.stated or problem)
 
 
 def _said_of(problem: Problem, resting: RestingLimits, found: Verdict) -> Verdict:

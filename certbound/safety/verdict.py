@@ -69,7 +69,8 @@ class Verdict(Shown):
     cells : tuple of Cell
         Where constants are drawn, the cells of their values over which the bounds were averaged.
     stated : Problem or None
-        Where limits move, the problem in coordinates in which they rest, of which the answers speak.
+        Where limits move, the problem in coordinates in which they rest, of which the answers speak: failing is at most
+        as probable as there.
     """
 
     pictured: ClassVar[bool] = True
@@ -152,7 +153,8 @@ class Verdict(Shown):
 
         if self.problem is None:
             raise ValueError("`problem` must be set for safe starts; verify_safety sets it.")
-        problem = self.problem.replace(initial=self.problem.starts[0]) if self.members else self.problem
+        problem = self.stated or self.problem  # at time 0 coordinates that move are the states
+        problem = problem.replace(initial=problem.starts[0]) if self.members else problem
         found = bound_safe_starts(problem, self.answers, delta)  # the set is the same for every member of a union
         return replace(found, problem=self.problem)
 
