@@ -130,7 +130,7 @@ def _sets(scene: Scene, plane: Plane, layout: Trace) -> Trace:
     shapes = shapes_of(scene.problem, plane, limits, {k: band_of(scene, c, plane) for k, c in enumerate(safe)})
     ranges = [numbers(np.array(limits[:2])), numbers(np.array(limits[2:]))]
     axes = [layout[name] | {"range": end, "zeroline": False} for name, end in zip(("xaxis", "yaxis"), ranges)]
-    if any(c.region.form.even and set(asked_of(c.region)) == set(plane) for c in safe):
+    if any(c.region.form.even and set(asked_of(c.region)) == set(plane) for c in (one.at_first() for one in safe)):
         axes[1] |= {"scaleanchor": "x", "scaleratio": 1}
     return {"shapes": shapes, "xaxis": axes[0], "yaxis": axes[1]}
 

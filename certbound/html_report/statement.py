@@ -144,8 +144,8 @@ def _asked(constraint: Inside, unit: str, states: tuple[str, ...]) -> Markup:
 
 def _faces(region: Region, states: tuple[str, ...]) -> str:
     """The inequalities of a polytope, which its label only counts, and all sides of a box that has many."""
-    form = region.form
-    if not isinstance(form, Faces) or region.moving or len(form.bounds) < 3 or (form.axial and len(states) <= 4):
+    form = None if region.moving else region.form
+    if not isinstance(form, Faces) or len(form.bounds) < 3 or (form.axial and len(states) <= 4):
         return ""
     rows = region.lifted(form.normals, len(states))
     bounds = form.bounds + form.normals @ region.center_at()

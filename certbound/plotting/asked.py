@@ -63,8 +63,8 @@ def panels_of(problem: Problem) -> list[Panel]:
 
 
 def _distance_label(constraint: Inside) -> str:
-    region = constraint.region
-    if region.form.even and not region.moving:
+    region = constraint.at_first().region
+    if not constraint.region.changing and region.form.even and not region.moving:
         place = ", ".join(f"{value:g}" for value in region.center_at())
         return f"distance to the ball around ({place})"
     label = str(constraint.label).removeprefix("outside ").removeprefix("inside ")

@@ -28,7 +28,7 @@ def plane_of(problem: Problem) -> Plane | None:
 
     A single half-space asks for a panel over time, not for a plane.
     """
-    for constraint in sorted(problem.safe, key=lambda one: not one.outside):  # obstacles first
+    for constraint in (one.at_first() for one in sorted(problem.safe, key=lambda one: not one.outside)):  # obstacles first
         asked, form = asked_of(constraint.region), constraint.region.form
         if len(asked) == 2 and not (isinstance(form, Faces) and len(form.bounds) == 1):
             return asked[0], asked[1]
@@ -59,15 +59,15 @@ def draw_plane(axes: Axes, scene: Scene, plane: Plane) -> None:
     axes.autoscale_view()
     limits = frame_of(scene.problem, plane, (*axes.get_xlim(), *axes.get_ylim()))
     for constraint in scene.problem.safe:
-        if lives_in(constraint.region, plane):
+        if lives_in(constraint.at_first().region, plane):
             band = band_of(scene, constraint, plane)
             draw_set(axes, constraint, plane, limits, band, horizon=float(scene.problem.horizon))
     target = scene.problem.reach
-    if target is not None and lives_in(target.region, plane):
+    if target is not None and lives_in(target.at_first().region, plane):
         draw_set(axes, target, plane, limits, style=TARGET)
     names = [scene.problem.axis(name) for name in scene.problem.system.states]
     axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
-    if any(c.region.form.even and lives_in(c.region, plane) for c in scene.problem.safe):
+    if any(c.region.form.even and lives_in(c.region, plane) for c in (one.at_first() for one in scene.problem.safe)):
         axes.set_aspect("equal", adjustable="box")
 
 
@@ -120,10 +120,10 @@ def frame_of(problem: Problem, plane: Plane, limits: tuple[float, ...]) -> tuple
     goal = () if problem.reach is None else (problem.reach,)
     for constraint in (*problem.safe, *goal):
         region = constraint.region
-        if set(asked_of(region)) != set(plane):
+        if set(asked_of(constraint.at_first().region)) != set(plane):
             continue
         for t in constraint.during or (0.0, float(problem.horizon)):
-            hull = region.hull(t)[np.array(order_in(region, plane))]
+            hull = region.at(t).hull()[np.array(order_in(region, plane))]
             size = hull.hi - hull.lo
             room = np.where(np.isfinite(size), np.minimum(0.12 * size, 0.5), 0.0)
             low = np.where(np.isfinite(hull.lo), np.minimum(low, hull.lo - room), low)
@@ -172,7 +172,8 @@ def _outline(
 ) -> None:
     from matplotlib.patches import Circle, Polygon
 
-    centre = region.center_at(t)
+    region = region.at(t)
+    centre = region.center_at()
     if isinstance(region.form, Quadratic) and region.form.even:
         axes.add_patch(Circle(tuple(centre[order_in(region, plane)]), region.form.radius, **style))
         return
@@ -220,7 +221,7 @@ def _cut(corners: Array, row: Array, bound: float) -> Array:
 
 def band_of(scene: Scene, constraint: Inside, plane: Plane) -> float:
     """The largest stochastic deviation in the plane: how far a set that lives in it is grown in the picture."""
-    region = constraint.region
+    region = constraint.at_first().region
     if scene.tube is None or set(asked_of(region)) != set(plane):
         return 0.0
     assert scene.reach is not None

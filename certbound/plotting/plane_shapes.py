@@ -26,14 +26,14 @@ def shapes_of(
     """Every set that can be drawn in the plane, with bands of the given widths by the constraints' numbers."""
     shapes: list[Shape] = []
     for number, constraint in enumerate(problem.safe):
-        if not lives_in(constraint.region, plane):
+        if not lives_in(constraint.at_first().region, plane):
             continue
         band = (bands or {}).get(number, 0.0)
         wider = grown_by(constraint.region, band if constraint.outside else -band) if band > 0 else None
         if wider is not None:
             shapes += _shape(constraint, wider, plane, limits, BAND if constraint.outside else INSET)
         shapes += _shape(constraint, constraint.region, plane, limits, SOLID if constraint.outside else BORDER)
-    if problem.reach is not None and lives_in(problem.reach.region, plane):
+    if problem.reach is not None and lives_in(problem.reach.at_first().region, plane):
         shapes += _shape(problem.reach, problem.reach.region, plane, limits, TARGET)
     return [*shapes, *_starts(problem, plane)]
 
@@ -41,7 +41,8 @@ def shapes_of(
 def _shape(
     constraint: Inside, region: Region, plane: Plane, limits: tuple[float, ...], style: Shape
 ) -> list[Shape]:
-    centre = region.center_at(constraint.during[0] if constraint.during else 0.0)
+    region = region.at(constraint.during[0] if constraint.during else 0.0)
+    centre = region.center_at()
     if isinstance(region.form, Quadratic) and region.form.even:
         (x, y), r = centre[order_in(region, plane)].tolist(), region.form.radius
         return [{"type": "circle", "x0": x - r, "x1": x + r, "y0": y - r, "y1": y + r, **style}]

@@ -158,11 +158,11 @@ def _frame(axes: Axes, starts: SafeStarts, plane: Plane, chart: Chart) -> None:
     room = [0.04 * (high - low) for low, high in ends]
     limits = tuple(end for (low, high), more in zip(ends, room) for end in (low - more, high + more))
     for constraint in starts.problem.safe:
-        if lives_in(constraint.region, plane):
+        if lives_in(constraint.at_first().region, plane):
             draw_set(axes, constraint, plane, limits, 0.0)
     names = [starts.problem.axis(name) for name in starts.problem.system.states]
     axes.set(xlim=limits[:2], ylim=limits[2:], xlabel=names[plane[0]], ylabel=names[plane[1]])
-    if any(c.region.form.even and lives_in(c.region, plane) for c in starts.problem.safe):
+    if any(c.region.form.even and lives_in(c.region, plane) for c in (one.at_first() for one in starts.problem.safe)):
         axes.set_aspect("equal", adjustable="box")
 
 

@@ -55,6 +55,10 @@ class Inside:
         """The same constraint, its label made from the states' names unless the user gave one."""
         return self if self.label is not None else replace(self, label=self.region.describe(states, self.word))
 
+    def at_first(self) -> Inside:
+        """The constraint with its sides as they are when it first counts, where they move; for pictures and words."""
+        return replace(self, region=self.region.at((self.during or (0.0,))[0])) if self.region.changing else self
+
     def satisfied(self, x: ArrayLike, t: float = 0.0) -> Mask:
         """Whether states, shape (..., n), satisfy the constraint at time t (its window aside)."""
         return np.asarray(self.region.contains(x, t) != self.outside)

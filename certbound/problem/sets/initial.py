@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,8 +29,7 @@ def check_start(initial: Region | GaussianStart, constraints: Sequence[Inside], 
     for constraint in constraints:
         if constraint.during is not None and constraint.during[0] > 0:
             continue
-        if constraint.region.changing:
-            constraint = replace(constraint, region=constraint.region.at(0.0))
+        constraint = constraint.at_first()
         with np.errstate(all="ignore"):
             place = constraint.region.center_at()
         if not np.all(np.isfinite(place)):
