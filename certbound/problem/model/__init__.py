@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         kinks_where,
         undefined_where,
     )
-    from certbound.problem.model.recombined import in_logarithms, turned_tape
+    from certbound.problem.model.recombined import in_logarithms, turned_tape, without_own
     from certbound.problem.model.tape import ARITY, JUMPS, Node, Tape, needed
     from certbound.problem.model.time_jumps import Change, between_jumps, cut_at_jumps
     from certbound.problem.model.tracing import call_network, trace
@@ -48,7 +48,7 @@ _HOME = {
     "comparisons": "rounded_comparison",
     "network_rows": "relaxed weights_of",
     "network_data": "PARTS Layer Network Part",
-    "recombined": "in_logarithms turned_tape",
+    "recombined": "in_logarithms turned_tape without_own",
     "operations": "OPERATIONS ROWS arithmetic enclosed jumps_where kinks_where undefined_where",
     "tape": "ARITY JUMPS Node Tape needed",
     "time_jumps": "between_jumps Change cut_at_jumps",
@@ -96,6 +96,7 @@ __all__ = [
     "varying_outputs",
     "watched",
     "weights_of",
+    "without_own",
 ]
 
 __getattr__, __dir__ = lazily(__name__, _HOME, __all__)

@@ -71,6 +71,19 @@ def turned_tape(
     return sums.graph.tape([sums.node(one) for one in found], tape.shape), rows, bent
 
 
+def without_own(tape: Tape, states: int) -> tuple[Tape, list[float]]:
+    """f(t, x, ...) - c x of a tape f over (t, states, ...) of shape (states,), and c: what f_i adds of x_i by itself."""
+    sums = _Sums(tape.inputs)
+    own = [sums.graph.input(slot) for slot in range(len(tape.inputs))]
+    found: list[Sum] = tape.evaluate(sums.arithmetic(), [Sum({node: _ONE}) for node in own])
+    slopes = [float(one.terms.get(own[1 + place], 0)) for place, one in enumerate(found)]
+    rest = [
+        Sum({node: c for node, c in one.terms.items() if node != own[1 + place]}, one.constant)
+        for place, one in enumerate(found)
+    ]  # fmt: skip
+    return sums.graph.tape([sums.node(one) for one in rest], tape.shape), slopes
+
+
 class _Sums:
     """The arithmetic of sums over a graph; ``seen`` are those that went into other operations."""
 

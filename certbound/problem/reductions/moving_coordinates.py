@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.problem.model import Graph, Tape, jacobian
-from certbound.problem.reductions.formulas_of_time import Formula, combined, node_of
+from certbound.problem.model import Graph, Tape, jacobian, without_own
+from certbound.problem.reductions.formulas_of_time import Formula, combined, difference, node_of, scaled
 from certbound.problem.systems import ContinuousSystem, DiscreteSystem, System
 
 
@@ -29,11 +29,15 @@ class Motion:
 
     @classmethod
     def of_limits(cls, low: Formula, high: Formula) -> Motion:
-        """The one in which an interval stays where it is at time 0: q = w/w(0) and p = low - low(0) q, w = high - low."""
+        """The one in which an interval stays where it is at time 0.
 
-        wide = combined("sub", high, low)
+        q = r/r(0) and p = c - c(0) q with r half its width and c its middle: limits that mirror each other move no
+        middle.
+        """
+        middle = scaled(difference(high, scaled(low, -1.0)), 0.5)
+        wide = difference(high, low)
         scale = combined("div", wide, start_of(wide))
-        return cls(offset=combined("sub", low, combined("mul", start_of(low), scale)), scale=scale)
+        return cls(offset=difference(middle, combined("mul", start_of(middle), scale)), scale=scale)
 
     @classmethod
     def of_place(cls, place: Formula) -> Motion:
@@ -82,6 +86,11 @@ class _Moved:
     def at(self, part: Formula | None, time: int) -> int:
         return self.graph.const(1.0) if part is None else node_of(self.graph, part, time)
 
+    def speed(self, motion: Motion, factor: float) -> int:
+        """p' - factor p."""
+        own = self.apply("mul", self.graph.const(factor), self.at(motion.offset, self.given[0]))
+        return self.apply("sub", self.slope(motion.offset), own)
+
     def slope(self, part: Formula | None) -> int:
         """The derivative in time; where it jumps, at known times of no weight, the value there does not matter."""
         if not isinstance(part, Tape):
@@ -91,16 +100,26 @@ class _Moved:
 
 
 def _dynamics(closed: Tape, motions: Mapping[int, Motion], *, discrete: bool) -> Tape:
+    """The drift, or the map, of y.
+
+    What f_i adds of x_i by itself, c x_i, is c p_i/q_i + c Y_i in continuous time: a product of q_i and 1/q_i, which
+    intervals would not see to be 1, is left out.
+    """
     moved = _Moved(closed.inputs, motions)
-    rates = closed.evaluate(moved.plain, moved.x)
+    rest, own = (closed, [0.0] * len(closed.outputs)) if discrete else without_own(closed, len(closed.outputs))
+    rates = rest.evaluate(moved.plain, moved.x)
     later = moved.apply("add", moved.given[0], moved.graph.const(1.0)) if discrete else moved.given[0]
-    for place, motion in motions.items():
-        if discrete:
-            taken = moved.at(motion.offset, later)
-        else:
-            own = moved.apply("mul", moved.slope(motion.scale), moved.given[1 + place])
-            taken = moved.apply("add", moved.slope(motion.offset), own)
-        rates[place] = moved.apply("div", moved.apply("sub", rates[place], taken), moved.at(motion.scale, later))
+    for place, factor in enumerate(own):
+        y, motion = moved.given[1 + place], motions.get(place)
+        if motion is not None:
+            taken = moved.at(motion.offset, later) if discrete else moved.speed(motion, factor)
+            left = moved.apply("sub", rates[place], taken)
+            rates[place] = moved.apply("div", left, moved.at(motion.scale, later))
+        slope = moved.graph.const(factor)
+        if motion is not None and motion.scale is not None and not discrete:
+            stretch = moved.apply("div", moved.slope(motion.scale), moved.at(motion.scale, later))
+            slope = moved.apply("sub", slope, stretch)
+        rates[place] = moved.apply("add", rates[place], moved.apply("mul", slope, y))
     return moved.graph.tape(rates, closed.shape)
 
 
@@ -117,5 +136,6 @@ def _gain(gain: Array | Tape, states: tuple[str, ...], motions: Mapping[int, Mot
     for place in stretched:
         scale = moved.at(motions[place].scale, time)
         for column in range(place * count, (place + 1) * count):
-            entries[column] = moved.apply("div", entries[column], scale)
+            if moved.graph.number(entries[column]) != 0.0:
+                entries[column] = moved.apply("div", entries[column], scale)
     return moved.graph.tape(entries, tuple(gain.shape))

@@ -31,6 +31,7 @@ DEGREE = 2  # of the interpolants in time
 CLOCK = 2e-13  # share of the horizon by which knots may be off
 HALF = 1e-11  # share of the horizon: half the length of a slab about a jump or a bend of the clock
 _GRID = 4000  # points at which jumps and bends of the clock are looked for
+_ROUNDING = 1e-15  # of a value: what its third difference may be by rounding alone
 _MOST = 200  # of these
 _PIECES = 4  # of a disturbance's interval where the model is not affine in it
 _MOST_NODES = 16
@@ -249,6 +250,6 @@ def pace_of(tapes: Sequence[Tape], horizon: float, middle: Array) -> float:
         value = np.broadcast_to(compile_numpy(tape)(grid, *middle)[..., 0], grid.shape)
         third = np.abs(np.diff(value, 3)) / (1.0 / _GRID) ** 3
         typical = float(np.quantile(third, 0.98)) if len(third) else 0.0  # jumps and bends have knots of their own
-        if typical > 0:
+        if typical > _ROUNDING * _GRID**3 * float(np.abs(value).max()):
             shortest = min(shortest, (float(np.ptp(value)) / typical) ** (1 / 3))
     return shortest
