@@ -36,7 +36,7 @@ problem.loops
 problem.random_constants
 problem.ingredients
 problem.problem
-problem.jumps_as_plan problem.held
+problem.jumps_as_plan problem.held problem.reductions
 problem problem.library
 problem.foreign
 problem.export problem.files
@@ -130,13 +130,13 @@ MANY_DOORS = {
     "values.continuous": (16, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
     "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
-    "problem.model": (40, "the one description of functions, which every room reads, differentiates and evaluates"),
+    "problem.model": (41, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (21, "events in both times, for noise that depends on the state and not; units; jumps"),
     "reach.linear": (19, "certificates state the records of the search: linearisations, shares; bounds from below"),
     "constants.jacobians": (15, "nine of them are what users take of the constants room"),
     "constants.programs": (16, "one program each for rate, gain and erosion, with what it is asked; the solver"),
     "checker.balls": (14, "operations on ball matrices, as a library would offer them"),
-    "problem.sets": (18, "the sets and constraints that users write, and the two forms that everybody reads"),
+    "problem.sets": (22, "the sets and constraints that users write, and the two forms that everybody reads"),
     "reach.nominal": (11, "curves, series and cells, which every kind of tube is made of"),
     "checker.statement": (17, "what a certificate states is read once and asked by all proofs; other coordinates"),
     "tubes.kummer": (10, "one tube, one mixture and one exit probability, with their checks and searches"),

@@ -28,8 +28,9 @@ def plane_of(problem: Problem) -> Plane | None:
 
     A single half-space asks for a panel over time, not for a plane.
     """
-    for constraint in (one.at_first() for one in sorted(problem.safe, key=lambda one: not one.outside)):  # obstacles first
-        asked, form = asked_of(constraint.region), constraint.region.form
+    for constraint in sorted(problem.safe, key=lambda one: not one.outside):  # obstacles first
+        region = constraint.at_first().region
+        asked, form = asked_of(region), region.form
         if len(asked) == 2 and not (isinstance(form, Faces) and len(form.bounds) == 1):
             return asked[0], asked[1]
     return (0, 1) if problem.system.dimension == 2 else None

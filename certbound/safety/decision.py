@@ -26,9 +26,8 @@ from certbound.safety.engines import prove_truncated
 from certbound.safety.falsification import Violation, find_violation
 from certbound.safety.members import worst_verdict
 from certbound.safety.misses import arrival, best_time, find_miss, window_of
-from certbound.safety.moving_limits import is_moving, moving_verdict
 from certbound.safety.portfolio import ENGINES, Engine, check_request, engines_of, in_order
-from certbound.safety.search import Action, Standing, Turn, next_action
+from certbound.safety.search import Action, Standing, Turn, is_moving, moving_verdict, next_action
 from certbound.safety.verdict import Verdict, best_lower, is_safe, stopped, undone, unfinished, unsafe, verdict_of
 from certbound.tubes.constants import Constants
 from certbound.watch import OutOfTime, Watch, current_watch

@@ -12,14 +12,14 @@ its least value between them (an error of fourth order in the step), where an os
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.problem.sets import Faces, Inside, Outside, Quadratic
+from certbound.problem.sets import Faces, Inside, Outside, Quadratic, Region
 from certbound.simulation.tape_text import Parameters, indent, linear_form, vector
 from certbound.simulation.wide_text import product
 
@@ -145,18 +145,14 @@ def _watched(problem: Any, constraints: Sequence[Inside], times: Array) -> list[
         embed = np.eye(problem.system.dimension)[region.places(problem.system.dimension)]
         centers = np.array([region.center_at(t) for t in times]) if region.moving else region.center_at()
         window = (min(first, last), min(end, last))
-        match region.at(float(times[window[0]])).form if region.changing else region.form:
-            case Quadratic() as form if region.changing:
-                radii = _over_window(times, window, lambda t, region=region: region.at(t).form.radius)
-                fields = _round_fields(form, embed, centers, np.asarray(radii))
-            case Faces() as form if region.changing and len(form.bounds):
-                bounds = _over_window(times, window, lambda t, region=region: region.at(t).form.bounds)
+        form = region.at(float(times[window[0]])).form if region.changing else region.form
+        match form:
+            case Quadratic():
+                radii = _over_window(region, times, window) if region.changing else None
+                fields = _round_fields(form, embed, centers, radii)
+            case Faces() if len(form.bounds):
+                bounds = _over_window(region, times, window) if region.changing else form.bounds
                 offset = bounds + centers @ form.normals.T
-                fields = {"round": False, "matrix": form.normals @ embed, "offset": offset}
-            case Quadratic() as form:
-                fields = _round_fields(form, embed, centers)
-            case Faces() as form if len(form.bounds):
-                offset = form.bounds + centers @ form.normals.T
                 fields = {"round": False, "matrix": form.normals @ embed, "offset": offset}
             case _:
                 continue
@@ -166,10 +162,13 @@ def _watched(problem: Any, constraints: Sequence[Inside], times: Array) -> list[
     return barriers
 
 
-def _over_window(times: Array, window: tuple[int, int], sides: Callable[[float], Any]) -> Array:
-    """Sides at all times, as they are in a window; beyond it, where nothing asks for them, those of its ends."""
+def _over_window(region: Region, times: Array, window: tuple[int, int]) -> Array:
+    """Bounds or radii at all times, as they are in a window; beyond it, where nothing asks for them, as at its ends."""
     first, last = window
-    inside = [sides(float(t)) for t in times[first : last + 1]]
+    inside = []
+    for t in times[first : last + 1].tolist():
+        form = region.at(t).form
+        inside.append(form.bounds if isinstance(form, Faces) else form.radius)
     return np.array([*[inside[0]] * first, *inside, *[inside[-1]] * (len(times) - 1 - last)], dtype=float)
 
 
@@ -387,7 +386,8 @@ def _round(
     start = distance(old, "x", "0")
     start += [if_all(starts_at_once(number, barrier), f"{old} {beyond} {first} * {first}"), f"    left = {number}"]
     step = distance(new, "y", "k + 1")
-    step += [if_all(f"{new} {beyond} {radius} * {radius}", *window_test(number, barrier, "k + 1")), f"    left = {number}"]
+    out = f"{new} {beyond} {radius} * {radius}"
+    step += [if_all(out, *window_test(number, barrier, "k + 1")), f"    left = {number}"]
     end = [f"{old} = {new}"]
     if bridge is None:
         return start, step, []

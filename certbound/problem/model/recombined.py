@@ -72,7 +72,7 @@ def turned_tape(
 
 
 def without_own(tape: Tape, states: int) -> tuple[Tape, list[float]]:
-    """f(t, x, ...) - c x of a tape f over (t, states, ...) of shape (states,), and c: what f_i adds of x_i by itself."""
+    """f - c x of a tape f over (t, states, ...) of shape (states,), and c: what f_i adds of x_i by itself."""
     sums = _Sums(tape.inputs)
     own = [sums.graph.input(slot) for slot in range(len(tape.inputs))]
     found: list[Sum] = tape.evaluate(sums.arithmetic(), [Sum({node: _ONE}) for node in own])

@@ -129,8 +129,10 @@ def _gain(gain: Array | Tape, states: tuple[str, ...], motions: Mapping[int, Mot
     if not isinstance(gain, Tape) and not any(np.any(gain[place]) for place in stretched):
         return gain
     moved = _Moved(("t", *states), motions)
-    flat = np.asarray(gain).ravel().tolist() if not isinstance(gain, Tape) else None
-    entries = gain.evaluate(moved.plain, moved.x) if isinstance(gain, Tape) else [moved.graph.const(x) for x in flat]
+    if isinstance(gain, Tape):
+        entries = gain.evaluate(moved.plain, moved.x)
+    else:
+        entries = [moved.graph.const(entry) for entry in gain.ravel().tolist()]
     count = gain.shape[1]
     time = moved.apply("add", moved.given[0], moved.graph.const(1.0)) if later else moved.given[0]
     for place in stretched:

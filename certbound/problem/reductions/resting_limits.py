@@ -1,10 +1,10 @@
 """Problems whose limits move as problems whose limits rest, in coordinates that move with the limits.
 
 In coordinates x_i = p_i(t) + q_i(t) y_i (`moving_coordinates`) a path breaks a limit x_i <= h(t) just where y_i breaks
-y_i <= (h(t) - p_i(t))/q_i(t). Of each state one interval, or one limit, decides p_i and q_i, and rests. What still moves
-is bounded over its window: for upper bounds the set to stay in, or to arrive in, is made smaller and an obstacle larger,
-so that failing is no less probable; for lower bounds the other way round. Both are the same problem where nothing moves
-any more and no number had to be rounded: then the two problems fail on the same paths.
+y_i <= (h(t) - p_i(t))/q_i(t). Of each state one interval, or one limit, decides p_i and q_i, and rests. What still
+moves is bounded over its window: for upper bounds the set to stay in, or to arrive in, is made smaller and an obstacle
+larger, so that failing is no less probable; for lower bounds the other way round. Both are the same problem where
+nothing moves any more and no number had to be rounded: then the two problems fail on the same paths.
 """
 
 from __future__ import annotations
@@ -202,19 +202,13 @@ class _Resting:
         limits = self._limits(place)
         if not any(isinstance(limit.face.place, Tape) for limit in limits):
             return
-        (low, at_low), (high, at_high) = (self._innermost(limits, side) for side in (0, 1))
-        if low is None or high is None:
-            one = low if high is None else high
-            assert one is not None
-            self.motions[place] = Motion.of_place(one)
-        elif not isinstance(difference(high, low), Tape):
-            self.motions[place] = Motion.of_place(low)
-        else:
-            self.motions[place] = Motion.of_limits(low, high)
-        if low is not None and high is not None:
-            self.resting |= dict.fromkeys(at_low, low) | dict.fromkeys(at_high, high)
-        else:
-            self.resting |= dict.fromkeys([*at_low, *at_high], one)
+        ends = [self._innermost(limits, side) for side in (0, 1)]
+        found = [end for end, _ in ends if end is not None]
+        alike = len(found) == 1 or not isinstance(difference(found[1], found[0]), Tape)
+        self.motions[place] = Motion.of_place(found[0]) if alike else Motion.of_limits(*found)
+        for end, faces in ends:
+            if end is not None:
+                self.resting |= dict.fromkeys(faces, end)
 
     def _limits(self, place: int) -> list[_Limit]:
         """The limits to paths of a state: of sets to stay in, of half-spaces to avoid, and in one state of others.
@@ -262,7 +256,8 @@ class _Resting:
         near = table >= most - _NEAR * (1 + np.abs(most))
         best = int(np.argmax(near.sum(axis=1)))
         if near[best].all():
-            return places[best], [face for face, own in zip(faces, near) if own.all() and self._alike(face, places[best])]
+            alike = [face for face, own in zip(faces, near) if own.all() and self._alike(face, places[best])]
+            return places[best], alike
         turns = [k for k in range(len(faces)) if near[k].any()]
         plain = all(not faces[k].constraint.outside and faces[k].constraint is not self.target
                     and faces[k].window == self.whole for k in turns)  # fmt: skip
@@ -308,7 +303,8 @@ class _Resting:
             return
         taken = {one.state for one in self.faces} | set(self.motions)
         balls = [one.region.places(self.n) for one in self.all if isinstance(one.region, (Ball, Ellipsoid))]
-        free = [k for k in np.flatnonzero(face.normal).tolist() if k not in taken and not any(k in own for own in balls)]
+        taken |= {k for own in balls for k in own}
+        free = [k for k in np.flatnonzero(face.normal).tolist() if k not in taken]
         if not free:
             return
         place = max(free, key=lambda k: abs(face.normal[k]))
@@ -346,7 +342,8 @@ class _Resting:
             if other.state != place or other.window != self.whole or not isinstance(start_of(start), float):
                 continue
             own, alike = face.factor * float(at_start(start).lo), other.factor * face.factor > 0
-            if stays and alike and other.constraint is not self.target and not other.constraint.outside and least >= own:
+            limit = other.constraint is not self.target and not other.constraint.outside
+            if stays and alike and limit and least >= own:
                 self.hidden[face] = own
             beyond = other.constraint is self.target and not alike and isinstance(face.constraint.region, (Box, Ball))
             if beyond and self.n == 1 and not self.discrete and least >= own and self._start_before(face, own):
@@ -373,7 +370,7 @@ class _Resting:
         try:
             domain = self.domain and self._reshaped(self.domain, narrow).region
             if problem.ending and domain is not problem.domain:
-                raise InfeasibleError('limits that move are not served where leaving the domain "ends" a path along them.')
+                raise InfeasibleError('limits that move are not served along a `domain` that "ends" paths.')
             target = self.target and self._reshaped(self.target, narrow)
             return problem.replace(
                 system=moved_system(system, problem.closed_loop, self.motions, signals),
@@ -408,38 +405,37 @@ class _Resting:
             side[face.state] = sign * bound
         if np.any(low > high):
             raise InfeasibleError(
-                f"nothing is inside of '{constraint.label}' at all times in the coordinates in which others rest, since "
-                "it moves in another way; state limits that move alike, or shorten the horizon."
+                f"nothing is inside of '{constraint.label}' at all times in the coordinates in which others rest: it "
+                "moves in another way; state limits that move alike, or shorten the horizon."
             )
         return Box(low, high)
 
     def _round(self, region: Any, constraint: Inside, larger: bool) -> Any:
+        if not isinstance(region, (Ball, Ellipsoid)):
+            raise InfeasibleError(f"'{constraint.label}' cannot be stated in moving coordinates; use a box or a ball.")
         places = region.places(self.n)
         scale = self._scale(places)
         centers = [self._moved(center, {place: 1.0}) for place, center in zip(places, entries_of(region.center))]
         if isinstance(region, Ellipsoid) and scale is None:
-            if any(isinstance(center, Tape) for center in centers):
-                return replace(region, center=stacked(centers))
-            return replace(region, center=np.array(centers))
+            return replace(region, center=stacked(centers))
         if not isinstance(region, Ball):
-            raise InfeasibleError(f"'{constraint.label}' cannot be stated in coordinates that are stretched; use a ball.")
+            raise InfeasibleError(f"'{constraint.label}' cannot be stated in stretched coordinates; use a ball.")
         window = constraint.during or self.whole
         size = combined("div", region.radius, scale) if scale is not None else region.radius
-        slack = 0.0
+        slack, center = 0.0, stacked(centers)
         if constraint in self.balls:
             starts = [at_start(center) for center in entries_of(region.center)]
             middles = [float((start.lo + start.hi) / 2) for start in starts]
             slack = sum(float(np.nextafter(start.hi - start.lo, np.inf)) for start in starts if start.lo < start.hi)
-            ends = at_start(region.radius)
-            low, high, center = float(ends.lo), float(ends.hi), np.array(middles)
+            ends, center = at_start(region.radius), stacked(middles)
+            low, high = float(ends.lo), float(ends.hi)
         else:
             low, high = range_over(size, window, discrete=self.discrete)
-            center = stacked(centers) if any(isinstance(one, Tape) for one in centers) else np.array(centers)
         if slack:
             low, high = float(np.nextafter(low - slack, -np.inf)), float(np.nextafter(high + slack, np.inf))
         self.rounded |= low < high
         if not (high if larger else low) >= 0:
-            raise InfeasibleError(f"nothing is inside of '{constraint.label}' at all times in the coordinates of others.")
+            raise InfeasibleError(f"nothing is inside of '{constraint.label}' at all times where other limits rest.")
         return replace(region, center=center, radius=high if larger else low)
 
     def _bound(self, face: _Face) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -161,7 +161,7 @@ class Region:
 
     @property
     def changing(self) -> bool:
-        """True when a side, the radius or a bound is a function of time, so that the set is of another size or shape."""
+        """True when a side, the radius or a bound is a function of time."""
         return bool(self.sides)
 
     def refuse_changing(self) -> None:
@@ -172,7 +172,7 @@ class Region:
                 "verify_safety, bound_exit_times and simulations do; give sides that rest, or move the centre."
             )
 
-    def at(self, t: float) -> Any:
+    def at(self, t: float) -> Self:
         """The set as it is at a time, which rests; its sides and centre are computed in plain floating point.
 
         ValueError where the sides describe no set then.
@@ -181,7 +181,8 @@ class Region:
         numbers = {name: float(value[0]) if name in ("radius", "bound") else value for name, value in sides.items()}
         if isinstance(self.center, Tape):
             numbers["center"] = self.center_at(t)
-        return replace(self, **numbers) if numbers else self  # type: ignore[type-var]  # a shape is a dataclass
+        shape: Any = self
+        return replace(shape, **numbers) if numbers else shape  # type: ignore[no-any-return]  # a shape is a dataclass
 
     @property
     def is_point(self) -> bool:
@@ -328,7 +329,8 @@ class Region:
                 return f"{word} a {self.kind or type(self).__name__} of {len(form.bounds)} faces"
 
     def _place(self, states: tuple[str, ...]) -> str:
-        place = "a moving centre" if isinstance(self.center, Tape) else "(" + ", ".join(f"{x:g}" for x in self.center_at()) + ")"
+        numbers = ", ".join(f"{x:g}" for x in self.center_at())
+        place = "a moving centre" if isinstance(self.center, Tape) else f"({numbers})"
         return place if self.coordinates is None else f"{place} in ({', '.join(states[k] for k in self.coordinates)})"
 
     def data(self, kinds: Collection[str]) -> dict[str, Any]:

@@ -92,11 +92,6 @@ def shifted(sides: Array | Tape, center: Array | Tape | None) -> Array | Tape:
     return stacked(found) if any(isinstance(one, Tape) for one in found) else frozen(found)
 
 
-def values_at(sides: Tape, t: float) -> Array:
-    """The sides at a time, shape (k,), in plain floating point."""
-    return np.asarray(compile_numpy(sides)(t), dtype=float)
-
-
 def times_of(window: tuple[float, float], discrete: bool) -> Array:
     """Times of a window at which sides are looked at: its steps, or some instants of it, both ends included."""
     first, last = window
@@ -130,8 +125,8 @@ def check_over_time(name: str, region: Any, window: tuple[float, float], discret
         if field == "radius" and np.any(value <= 0):
             when = int(np.argmax(value[:, 0] <= 0))
             raise ValueError(
-                f"`{name}` must have a positive `radius` at all times, got {value[when, 0]:g} at t = {times[when]:.6g}; "
-                "mend the expression, or end the set's `during` before that."
+                f"`{name}` must have a positive `radius` at all times, got {value[when, 0]:g} at "
+                f"t = {times[when]:.6g}; mend the expression, or end the set's `during` before that."
             )
     if region.sides.keys() & {"low", "high"}:
         _check_order(name, region, times)
@@ -145,8 +140,8 @@ def _check_order(name: str, region: Any, times: Array) -> None:
     if np.any(low > high):
         when, place = map(int, np.argwhere(low > high)[0])
         raise ValueError(
-            f"`{name}` must have `low` at most `high` at all times, got {low[when, place]:g} > {high[when, place]:g} in "
-            f"entry {place} at t = {times[when]:.6g}; mend the sides, or end the set's `during` before that."
+            f"`{name}` must have `low` at most `high` at all times, got {low[when, place]:g} > {high[when, place]:g} "
+            f"in entry {place} at t = {times[when]:.6g}; mend the sides, or end the set's `during` before that."
         )
 
 
@@ -162,7 +157,8 @@ def _sum(side: float | Tape, place: float | Tape) -> float | Tape:
 
 
 def _entries(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, (list, tuple)) or getattr(value, "dtype", None) == object else []
+    listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype.kind == "O")
+    return list(value) if listed else []
 
 
 def _side(name: str, entry: Any, infinite: bool) -> float | Tape:

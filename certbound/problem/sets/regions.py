@@ -1,9 +1,9 @@
 """The shapes of sets of states.
 
 A set may live in some of the coordinates only (``coordinates``). Its centre may move: ``center`` is then a tape over
-``("t",)``, made from a function of t, and what a set says at time t, it says about its shape moved to ``center(t)``. Its
-sides, radius or bounds may move too: they are tapes then, the set has no form that is the same at all times, and what
-it says at time t, it says about the set that it is then (``at``).
+``("t",)``, made from a function of t, and what a set says at time t, it says about its shape moved to ``center(t)``.
+Its sides, radius or bounds may move too: they are tapes then, the set has no form that is the same at all times, and
+what it says at time t, it says about the set that it is then (``at``).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array, Mask
-from certbound.checks import assign, frozen, matrix, number, pick, positive_definite, vector
+from certbound.checks import assign, frozen, matrix, pick, positive_definite, vector
 from certbound.problem.model import Tape, compile_numpy, trace
 from certbound.problem.sets.forms import Faces, Quadratic, Region, linear_maximum
 from certbound.problem.sets.moving import entries_of, read_side, read_sides, shifted

@@ -48,8 +48,8 @@ def bound_arrival(
     Raises
     ------
     InfeasibleError
-        Limits or targets that depend on time, a model that does with more than one start, disturbances, random starts, starts that are not on one side of
-        the target, or a limit between them and it.
+        Limits or targets that depend on time, a model that does with more than one start, disturbances, random starts,
+        starts that are not on one side of the target, or a limit between them and it.
     """
     side, start, spread = _placed(problem, model, target)
     aux = problem.replace(safe=[*problem.safe, Outside(target, label="the target")])

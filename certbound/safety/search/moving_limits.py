@@ -101,4 +101,5 @@ def _better(plain: Verdict, found: Verdict) -> Verdict:
     safe = is_at_most(level, found.problem.delta)
     unsafe = lower is not None and is_more_than(lower, found.problem.delta)
     status = best.status if best.status != "UNKNOWN" else "SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN"
-    return replace(best, status=status, log10_delta=level, log10_lower=lower, seconds={**plain.seconds, **found.seconds})
+    spent = {**plain.seconds, **found.seconds}
+    return replace(best, status=status, log10_delta=level, log10_lower=lower, seconds=spent)

@@ -1,0 +1,146 @@
+"""Verdicts on limits that move: near the truth where engines serve what rests, and never as if it stood still."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+import certbound as cb
+from certbound.errors import CertificateError, EngineError, InfeasibleError, contained
+from certbound.safety.answers import Request
+from certbound.safety.portfolio import ENGINES
+
+TIME = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=0.5)
+PLANE = cb.ContinuousSystem(lambda x: [x[1] - x[0], -x[0] - x[1]], states=["x", "y"], diffusion=0.3 * np.eye(2))
+STEPS = cb.DiscreteSystem(lambda x: 0.8 * x, states=["x"], noise=cb.Gaussian(std=0.2))
+PAIRS = cb.DiscreteSystem(lambda x: 0.8 * x, states=["x", "y"], noise=cb.Gaussian(std=0.2))
+
+
+def falling(t: Any) -> Any:
+    return 1 - 0.2 * t
+
+
+def moving_sets(n: int) -> list[cb.Inside]:
+    """Sets of every kind whose sides move; at time 0 most of them are much larger than later."""
+    e, eye = np.eye(n)[0], np.eye(n)
+    return [
+        cb.Inside(cb.Box([-1] * n, [falling, *[1] * (n - 1)])),
+        cb.Inside(cb.HalfSpace(e, falling)),
+        cb.Inside(cb.Ball(np.zeros(n), falling)),
+        cb.Inside(cb.Polytope(np.vstack([eye, -eye]), [falling, *[1] * (2 * n - 1)])),
+        cb.Outside(cb.Ball(2 + np.zeros(n), lambda t: 0.5 + 0.3 * t)),
+        cb.Outside(cb.Box([lambda t: 1.5 - 0.3 * t, *[-1] * (n - 1)], [3] * n)),
+        cb.Outside(cb.HalfSpace(-e, lambda t: 0.2 * t - 1)),
+    ]
+
+
+@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("system", [TIME, PLANE, STEPS, PAIRS])
+def test_no_engine_takes_a_side_that_moves_for_one_that_rests(name: str, system: Any) -> None:
+    n, row = system.dimension, ENGINES[name]
+    for constraint in moving_sets(n):
+        problem = cb.Problem(system, initial=np.zeros(n), safe=[constraint], horizon=2, delta=0.3)
+        for ask in (lambda asked: row.prove(asked, Request()), lambda asked: row.below and row.below(asked)):
+            try:
+                with contained(name):
+                    answer = ask(problem)
+            except EngineError as error:
+                assert "defect" not in str(error)
+                continue
+            assert answer is None or not answer.applicable, constraint.label
+
+
+def test_nothing_else_takes_a_side_that_moves_for_one_that_rests() -> None:
+    problem = cb.Problem(TIME, initial=[0], safe=[cb.Inside(cb.HalfSpace([1], falling))], horizon=2, delta=0.3)
+    for ask in (
+        cb.bound_metrics,
+        cb.bound_exit_times,
+        lambda asked: cb.bound_reach(asked).distance_to(asked.safe[0]),
+        cb.synthesize if hasattr(cb, "synthesize") else cb.bound_metrics,
+    ):
+        with pytest.raises((InfeasibleError, ValueError), match="mov|inputs"):
+            ask(problem)
+
+
+def test_bounds_of_discrete_limits_that_move_hold_a_simulation() -> None:
+    safe = [cb.Inside(cb.Box([lambda t: -0.9 * np.exp(-0.05 * t)], [lambda t: 0.9 * np.exp(-0.05 * t)]))]
+    problem = cb.Problem(STEPS, initial=[0], safe=safe, horizon=10, delta=0.5)
+    found = cb.verify_safety(problem, method="values")
+    counts = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(0))
+    assert found.log10_lower is not None
+    assert counts.lower - 0.01 <= 10**found.log10_lower <= 10**found.log10_delta <= counts.upper + 0.01
+    assert 10**found.log10_delta < 1.02 * 10**found.log10_lower
+    assert found.status == "SAFE"
+    assert "move with the limits" in found.reason
+    still = problem.replace(safe=[cb.Inside(cb.Box([-0.9], [0.9]))])
+    assert cb.verify_safety(still, method="values").log10_delta < found.log10_delta - 0.1
+
+
+def test_bounds_of_a_bound_that_collapses_hold_its_closed_form() -> None:
+    # of dx = v dt + dW and a line 1 - t from above: P(touched by T) = N(d) + exp(-2 m) N(-d - 2 sqrt(T) m ...)
+    from scipy.stats import norm
+
+    v, a, k, T = -1.0, 1.2, 0.25, 1.0
+    system = cb.ContinuousSystem(lambda x: v + 0 * x, states=["x"], diffusion=1.0)
+    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.HalfSpace([1], lambda t: a - k * t))], horizon=T, delta=0.1)
+    m = v + k  # the distance to the line is a Brownian motion with this drift
+    truth = norm.cdf((m * T - a) / np.sqrt(T)) + np.exp(2 * m * a) * norm.cdf((-m * T - a) / np.sqrt(T))
+    found = cb.verify_safety(problem, method="values")
+    assert found.log10_lower is not None
+    assert 10**found.log10_lower <= truth <= 10**found.log10_delta <= 1.05 * truth
+
+
+def test_a_target_that_comes_nearer_is_bounded_from_both_sides() -> None:
+    system = cb.ContinuousSystem(lambda x: 0.8 - x, states=["x"], diffusion=0.5)
+    safe = [cb.Inside(cb.HalfSpace([-1], lambda t: np.exp(-t / 2)))]
+    target = cb.HalfSpace([-1], lambda t: -np.exp(-t / 2))
+    problem = cb.Problem(system, initial=[0], safe=safe, reach=target, horizon=2, delta=0.2)
+    found = cb.verify_safety(problem, method="values", time_limit=10)
+    assert found.status == "SAFE"
+    counts = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(0))
+    assert counts.lower - 0.002 <= 10**found.log10_delta <= 1.25 * counts.probability
+    assert found.log10_lower is None or 10**found.log10_lower <= counts.upper + 0.002
+
+
+def test_no_certificate_states_limits_that_move_and_it_is_said_why() -> None:
+    problem = cb.Problem(STEPS, initial=[0], safe=[cb.Inside(cb.HalfSpace([1], falling))], horizon=3, delta=0.3)
+    found = cb.verify_safety(problem)
+    assert found.status == "SAFE"
+    assert found.certificate is None
+    with pytest.raises(CertificateError, match="no certificate states limits that move"):
+        found.certificate_text(problem)
+
+
+def test_centers_that_move_are_certified_where_the_problem_is_proved_as_it_is() -> None:
+    safe = [cb.Inside(cb.Box([-2], [2], center=lambda t: [0.2 * t]))]
+    problem = cb.Problem(TIME, initial=[0], safe=safe, horizon=1, delta=0.01)
+    found = cb.verify_safety(problem)
+    assert found.status == "SAFE"
+    assert json.loads(found.certificate_text(problem))["claim"]
+
+
+def test_safe_starts_are_those_at_time_0() -> None:
+    safe = [cb.Inside(cb.Box([lambda t: -1 - 0 * t], [falling]))]
+    problem = cb.Problem(STEPS, initial=[0], safe=safe, horizon=3, delta=0.05)
+    starts = cb.verify_safety(problem, method="values").safe_starts()
+    high = max(box[0][1] for box in starts.boxes.tolist())
+    assert 0 < high < 1
+    edge = cb.simulate_exits(problem.replace(initial=[high]), paths=40_000, rng=np.random.default_rng(0))
+    assert edge.lower <= 0.05
+
+
+def test_stated_constants_are_not_those_of_coordinates_that_move() -> None:
+    problem = cb.Problem(TIME, initial=[0], safe=[cb.Inside(cb.HalfSpace([1], falling))], horizon=2, delta=0.3)
+    found = cb.verify_safety(problem, constants=cb.Constants(rate=-1.0, sigma=0.5, dimension=1))
+    assert found.status == "UNKNOWN"
+    assert "stated constants" in found.reason
+
+
+def test_what_is_not_served_is_unknown_and_says_what_would_work() -> None:
+    jumps = cb.Inside(cb.HalfSpace([1], lambda t: np.where(t < 1, 1.0, 0.9)))
+    found = cb.verify_safety(cb.Problem(TIME, initial=[0], safe=[jumps], horizon=2, delta=0.3))
+    assert found.status == "UNKNOWN"
+    assert "during" in found.reason
