@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import certbound as cb
 from certbound.errors import CertificateError, EngineError, InfeasibleError, contained
@@ -37,19 +38,25 @@ def moving_sets(n: int) -> list[cb.Inside]:
     ]
 
 
+def asked(name: str, ask: Any, problem: cb.Problem) -> Any:
+    """What an engine answers; None where it refuses, in words of its own."""
+    try:
+        with contained(name):
+            return ask(problem)
+    except EngineError as error:
+        if "defect" in str(error):
+            raise
+        return None
+
+
 @pytest.mark.parametrize("name", ENGINES)
 @pytest.mark.parametrize("system", [TIME, PLANE, STEPS, PAIRS])
 def test_no_engine_takes_a_side_that_moves_for_one_that_rests(name: str, system: Any) -> None:
     n, row = system.dimension, ENGINES[name]
     for constraint in moving_sets(n):
         problem = cb.Problem(system, initial=np.zeros(n), safe=[constraint], horizon=2, delta=0.3)
-        for ask in (lambda asked: row.prove(asked, Request()), lambda asked: row.below and row.below(asked)):
-            try:
-                with contained(name):
-                    answer = ask(problem)
-            except EngineError as error:
-                assert "defect" not in str(error)
-                continue
+        for ask in (lambda one: row.prove(one, Request()), lambda one: row.below and row.below(one)):
+            answer = asked(name, ask, problem)
             assert answer is None or not answer.applicable, constraint.label
 
 
@@ -58,34 +65,32 @@ def test_nothing_else_takes_a_side_that_moves_for_one_that_rests() -> None:
     for ask in (
         cb.bound_metrics,
         cb.bound_exit_times,
-        lambda asked: cb.bound_reach(asked).distance_to(asked.safe[0]),
+        lambda one: cb.bound_reach(one).distance_to(one.safe[0]),
         cb.synthesize if hasattr(cb, "synthesize") else cb.bound_metrics,
     ):
-        with pytest.raises((InfeasibleError, ValueError), match="mov|inputs"):
+        with pytest.raises((InfeasibleError, ValueError), match=r"mov|inputs|stand still"):
             ask(problem)
 
 
 def test_bounds_of_discrete_limits_that_move_hold_a_simulation() -> None:
     safe = [cb.Inside(cb.Box([lambda t: -0.9 * np.exp(-0.05 * t)], [lambda t: 0.9 * np.exp(-0.05 * t)]))]
-    problem = cb.Problem(STEPS, initial=[0], safe=safe, horizon=10, delta=0.5)
+    problem = cb.Problem(STEPS, initial=[0], safe=safe, horizon=10, delta=0.2)
     found = cb.verify_safety(problem, method="values")
     counts = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(0))
     assert found.log10_lower is not None
     assert counts.lower - 0.01 <= 10**found.log10_lower <= 10**found.log10_delta <= counts.upper + 0.01
     assert 10**found.log10_delta < 1.02 * 10**found.log10_lower
-    assert found.status == "SAFE"
-    assert "move with the limits" in found.reason
+    assert found.status == "UNSAFE"
+    assert "step by step" in found.reason
     still = problem.replace(safe=[cb.Inside(cb.Box([-0.9], [0.9]))])
     assert cb.verify_safety(still, method="values").log10_delta < found.log10_delta - 0.1
 
 
 def test_bounds_of_a_bound_that_collapses_hold_its_closed_form() -> None:
-    # of dx = v dt + dW and a line 1 - t from above: P(touched by T) = N(d) + exp(-2 m) N(-d - 2 sqrt(T) m ...)
-    from scipy.stats import norm
-
     v, a, k, T = -1.0, 1.2, 0.25, 1.0
     system = cb.ContinuousSystem(lambda x: v + 0 * x, states=["x"], diffusion=1.0)
-    problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.HalfSpace([1], lambda t: a - k * t))], horizon=T, delta=0.1)
+    safe = [cb.Inside(cb.HalfSpace([1], lambda t: a - k * t))]
+    problem = cb.Problem(system, initial=[0], safe=safe, horizon=T, delta=0.1)
     m = v + k  # the distance to the line is a Brownian motion with this drift
     truth = norm.cdf((m * T - a) / np.sqrt(T)) + np.exp(2 * m * a) * norm.cdf((-m * T - a) / np.sqrt(T))
     found = cb.verify_safety(problem, method="values")
@@ -124,12 +129,12 @@ def test_centers_that_move_are_certified_where_the_problem_is_proved_as_it_is() 
 
 def test_safe_starts_are_those_at_time_0() -> None:
     safe = [cb.Inside(cb.Box([lambda t: -1 - 0 * t], [falling]))]
-    problem = cb.Problem(STEPS, initial=[0], safe=safe, horizon=3, delta=0.05)
+    problem = cb.Problem(STEPS, initial=[0], safe=safe, horizon=3, delta=0.2)
     starts = cb.verify_safety(problem, method="values").safe_starts()
     high = max(box[0][1] for box in starts.boxes.tolist())
     assert 0 < high < 1
     edge = cb.simulate_exits(problem.replace(initial=[high]), paths=40_000, rng=np.random.default_rng(0))
-    assert edge.lower <= 0.05
+    assert edge.lower <= 0.2
 
 
 def test_stated_constants_are_not_those_of_coordinates_that_move() -> None:

@@ -59,16 +59,21 @@ def difference(a: Formula, b: Formula) -> Formula:
     return node.value if node.op == "const" else found
 
 
-def at_start(part: Formula) -> Interval:
-    """Enclosure of the value at time 0, which is one number where it is known exactly."""
+def at_time(part: Formula, t: float) -> Interval:
+    """Enclosure of the value at a time, which is one number where it is known exactly."""
     if not isinstance(part, Tape):
         return Interval.point(part)
     graph = Graph(("t",))
-    found = _finished(graph, node_of(graph, part, graph.const(0.0)))
+    found = _finished(graph, node_of(graph, part, graph.const(t)))
     if not isinstance(found, Tape):
         return Interval.point(found)
-    value: Interval = found.evaluate(arithmetic("interval"), [Interval.point(0.0)])[0]
+    value: Interval = found.evaluate(arithmetic("interval"), [Interval.point(t)])[0]
     return value
+
+
+def at_start(part: Formula) -> Interval:
+    """Enclosure of the value at time 0."""
+    return at_time(part, 0.0)
 
 
 def may_jump(part: Formula) -> bool:

@@ -30,6 +30,7 @@ from certbound.problem.reductions.formulas_of_time import (
     scaled,
     values,
 )
+from certbound.problem.reductions.limits_by_step import limits_by_step
 from certbound.problem.reductions.moving_coordinates import Motion, moved_system, start_of
 from certbound.problem.sets import Ball, Box, Ellipsoid, HalfSpace, Inside, Polytope, entries_of, shifted, stacked
 
@@ -51,7 +52,7 @@ class RestingLimits:
     below : Problem or None
         P(failing) is at least this one's, from the worst start; ``above`` itself where the two are equal.
     states : tuple of str
-        The states that are stated in coordinates of their own.
+        The states that are stated in coordinates of their own; none where limits are stated step by step.
     """
 
     above: Problem | None
@@ -99,7 +100,7 @@ class _Limit:
 
 
 def bring_to_rest(problem: Problem) -> RestingLimits:
-    """The problem in coordinates in which as many of its limits rest as can.
+    """The problem in coordinates in which as many of its limits rest as can, or in discrete time step by step.
 
     Raises
     ------
@@ -122,9 +123,21 @@ def bring_to_rest(problem: Problem) -> RestingLimits:
     if problem.hold is not None:
         raise InfeasibleError("limits that move are not served where inputs are held; leave `hold` out.")
     try:
-        return _Resting(problem).found()
+        steps = limits_by_step(problem)
+        if steps is not None and steps != (None, None):
+            return RestingLimits(above=steps[0], below=steps[1], states=())
+        return by_coordinates(problem)
     except EnclosureError as error:
         raise InfeasibleError(f"limits that move could not be brought to rest: {error}") from error
+
+
+def by_coordinates(problem: Problem) -> RestingLimits:
+    """The problem in coordinates in which as many of its limits rest as can; errors are those of `bring_to_rest`."""
+    return _Resting(problem).found()
+
+
+class _EmptyError(InfeasibleError):
+    """Nothing is left of a set that is made smaller."""
 
 
 class _Resting:
@@ -374,11 +387,22 @@ class _Resting:
             target = self.target and self._reshaped(self.target, narrow)
             return problem.replace(
                 system=moved_system(system, problem.closed_loop, self.motions, signals),
-                safe=[self._reshaped(one, narrow) for one in problem.safe], reach=target, domain=domain,
+                safe=self._kept(narrow), reach=target, domain=domain,
                 plan=None if law else problem.plan, cost=None, units=None,
             ), ""  # fmt: skip
         except ValueError as error:
             return None, str(error)
+
+    def _kept(self, narrow: bool) -> list[Inside]:
+        """The constraints; without obstacles of which, made smaller, nothing is left."""
+        found = []
+        for constraint in self.problem.safe:
+            try:
+                found.append(self._reshaped(constraint, narrow))
+            except _EmptyError:
+                if narrow or not constraint.outside:
+                    raise
+        return found
 
     def _reshaped(self, constraint: Inside, narrow: bool) -> Inside:
         """The constraint in the new coordinates."""
@@ -404,7 +428,7 @@ class _Resting:
             side, sign = (high, 1.0) if face.factor > 0 else (low, -1.0)
             side[face.state] = sign * bound
         if np.any(low > high):
-            raise InfeasibleError(
+            raise _EmptyError(
                 f"nothing is inside of '{constraint.label}' at all times in the coordinates in which others rest: it "
                 "moves in another way; state limits that move alike, or shorten the horizon."
             )
@@ -435,7 +459,7 @@ class _Resting:
             low, high = float(np.nextafter(low - slack, -np.inf)), float(np.nextafter(high + slack, np.inf))
         self.rounded |= low < high
         if not (high if larger else low) >= 0:
-            raise InfeasibleError(f"nothing is inside of '{constraint.label}' at all times where other limits rest.")
+            raise _EmptyError(f"nothing is inside of '{constraint.label}' at all times where other limits rest.")
         return replace(region, center=center, radius=high if larger else low)
 
     def _bound(self, face: _Face) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The search for a verdict: which engine is asked next, and with which effort; and of limits that move in what terms."""
+"""The search for a verdict: which engine is asked next, with which effort, and limits that move at rest."""
 
 from certbound.safety.search.efforts import Action, Standing, Turn, next_action
 from certbound.safety.search.moving_limits import is_moving, moving_verdict

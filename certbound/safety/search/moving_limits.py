@@ -77,14 +77,19 @@ def _at_rest(problem: Problem, resting: RestingLimits, watch: Watch, decided: De
     below = _said_of(problem, resting, decided(resting.below))
     if not below.status.startswith("UNSAFE"):
         return replace(found, log10_lower=below.log10_lower)
-    return replace(below, log10_delta=found.log10_delta, answers=found.answers, stated=found.stated or problem)
+    return replace(
+        below, log10_delta=found.log10_delta, answers=found.answers, stated=found.stated or problem, margin=None,
+        time=None, constraint=None, tube=None, reach=None, constants=None, deviation=None,
+    )  # fmt: skip
 
 
 def _said_of(problem: Problem, resting: RestingLimits, found: Verdict) -> Verdict:
     """A verdict in coordinates that move as one on the problem: what is said of places is left out."""
-    names = ", ".join(resting.states)
-    reason = f"in coordinates of {names} that move with the limits: {found.reason}"
     assert found.problem is not None
+    if not resting.states:
+        reason = f"with limits that are stated step by step: {found.reason}"
+        return replace(found, problem=problem, stated=found.problem, reason=reason)
+    reason = f"in coordinates of {', '.join(resting.states)} that move with the limits: {found.reason}"
     return replace(
         found, problem=problem, stated=found.problem, reason=reason, margin=None, time=None, constraint=None,
         tube=None, reach=None, constants=None, deviation=None,

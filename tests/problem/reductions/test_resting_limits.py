@@ -11,7 +11,10 @@ import pytest
 import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, compile_numpy
-from certbound.problem.reductions import bring_to_rest
+from certbound.problem.reductions import RestingLimits, bring_to_rest
+from certbound.problem.reductions.resting_limits import by_coordinates
+
+Reduction = Callable[[cb.Problem], RestingLimits]
 
 FLOW = cb.ContinuousSystem(lambda x: 0.3 - np.sin(x), states=["x"], diffusion=lambda x: [[0.4 + 0.1 * x[0] ** 2]])
 PAIR = cb.ContinuousSystem(
@@ -50,9 +53,9 @@ def failing(problem: cb.Problem, noise: np.ndarray, horizon: float) -> np.ndarra
     return failed if problem.reach is None else failed | ~arrived
 
 
-def both(problem: cb.Problem, steps: int, count: int = 3000) -> tuple[np.ndarray, ...]:
+def both(problem: cb.Problem, steps: int, reduced: Reduction, count: int = 3000) -> tuple[np.ndarray, ...]:
     """Failing paths of the problem, and of what is above and below it."""
-    found = bring_to_rest(problem)
+    found = reduced(problem)
     noise = np.random.default_rng(5).standard_normal((steps, count, problem.system.dimension))
     assert found.above is not None
     assert found.below is not None
@@ -64,7 +67,7 @@ def band(low: Any, high: Any) -> list[cb.Inside]:
 
 
 def closing(t: Any) -> Any:
-    return np.exp(-0.3 * t)
+    return np.exp(-0.1 * t)
 
 
 EXACT: dict[str, cb.Problem] = {
@@ -78,7 +81,8 @@ EXACT: dict[str, cb.Problem] = {
     "jump": cb.Problem(STEPS, initial=[0], safe=band([-1], [lambda t: np.where(t < 4, 1.0, 0.75)]), horizon=8),
     "by turns": cb.Problem(
         STEPS, initial=[0], horizon=8,
-        safe=[cb.Inside(cb.HalfSpace([1], lambda t: 1.5 - 0.125 * t)), cb.Inside(cb.HalfSpace([1], lambda t: 0.75 + 0.0625 * t))],
+        safe=[cb.Inside(cb.HalfSpace([1], lambda t: 1.5 - 0.125 * t)),
+              cb.Inside(cb.HalfSpace([1], lambda t: 0.75 + 0.0625 * t))],
     ),
     "window": cb.Problem(PAIRS, initial=[0, 0], safe=band([lambda t: -closing(t), -1], [closing, 1]), horizon=8),
     "obstacle": cb.Problem(STEPS, initial=[0], safe=[cb.Outside(cb.HalfSpace([-1], lambda t: -closing(t)))], horizon=8),
@@ -89,9 +93,9 @@ EXACT: dict[str, cb.Problem] = {
 
 @pytest.mark.parametrize("name", EXACT)
 def test_the_same_paths_fail_where_all_limits_rest(name: str) -> None:
-    assert bring_to_rest(EXACT[name]).exact
-    plain, above, below = both(EXACT[name], 8)
-    assert 0.02 < plain.mean() < 0.98
+    assert by_coordinates(EXACT[name]).exact
+    plain, above, below = both(EXACT[name], 8, by_coordinates)
+    assert 0.01 < plain.mean() < 0.98
     assert np.count_nonzero(plain != above) <= 1  # rounding
     assert np.array_equal(above, below)
 
@@ -99,7 +103,8 @@ def test_the_same_paths_fail_where_all_limits_rest(name: str) -> None:
 BOTH: dict[str, Callable[[], cb.Problem]] = {
     "windows": lambda: cb.Problem(
         STEPS, initial=[0], horizon=8,
-        safe=[cb.Inside(cb.HalfSpace([1], closing)), cb.Inside(cb.HalfSpace([-1], lambda t: 0.4 + 0.1 * t), during=(2, 6))],
+        safe=[cb.Inside(cb.HalfSpace([1], closing)),
+              cb.Inside(cb.HalfSpace([-1], lambda t: 0.4 + 0.1 * t), during=(2, 6))],
     ),
     "target": lambda: cb.Problem(
         STEPS, initial=[0], horizon=8, safe=band([lambda t: -closing(t) - 0.2], [10]), reach=cb.Box([closing], [10])
@@ -116,9 +121,17 @@ BOTH: dict[str, Callable[[], cb.Problem]] = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("name", EXACT)
+def test_step_by_step_the_same_paths_fail(name: str) -> None:
+    assert bring_to_rest(EXACT[name]).states == ()
+    plain, above, below = both(EXACT[name], 8, bring_to_rest)
+    assert np.array_equal(plain, above)
+    assert np.array_equal(plain, below)
+
+
 @pytest.mark.parametrize("name", BOTH)
 def test_more_paths_fail_above_and_fewer_below_where_limits_still_move(name: str) -> None:
-    plain, above, below = both(BOTH[name](), 8)
+    plain, above, below = both(BOTH[name](), 8, by_coordinates)
     assert np.count_nonzero(plain & ~above) <= 1
     assert np.count_nonzero(below & ~plain) <= 1
 
@@ -127,8 +140,8 @@ def test_more_paths_fail_above_and_fewer_below_where_limits_still_move(name: str
 def test_drift_and_noise_of_a_flow_are_those_of_the_coordinates(system: cb.ContinuousSystem) -> None:
     n = system.dimension
     safe = band([lambda t: -0.9 + 0.2 * np.sin(t)] * n, [lambda t: 1.1 * closing(t)] * n)
-    plain, above, _ = both(cb.Problem(system, initial=[0.1] * n, safe=safe, horizon=1.0), 1500)
-    assert 0.1 < plain.mean() < 0.9
+    plain, above, _ = both(cb.Problem(system, initial=[0.1] * n, safe=safe, horizon=1.0), 500, bring_to_rest)
+    assert 0.01 < plain.mean() < 0.9
     assert np.mean(plain != above) < 0.01  # errors of Euler's scheme
 
 

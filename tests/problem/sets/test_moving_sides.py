@@ -81,7 +81,7 @@ def test_a_set_whose_sides_move_has_no_form_and_nothing_reads_its_sides_as_numbe
     [
         (cb.Box([lambda t: 4 * t - 1, -1], [1, 1]), r"safe\[0\].*at most `high` at all times.*at t = 0\.5"),
         (cb.Ball([0, 0], lambda t: 1 - 2 * t), r"positive `radius` at all times, got .* at t = 0\.5"),
-        (cb.HalfSpace([1, 0], lambda t: np.sqrt(0.5 - t)), r"defined whenever the set counts.*`bound` is nan at t = 0\.5"),
+        (cb.HalfSpace([1, 0], lambda t: np.sqrt(0.5 - t)), r"defined whenever the set counts.*is nan at t = 0\.5"),
     ],
 )
 def test_sides_that_are_no_set_at_some_time_are_refused_with_the_time(region: cb.Box, words: str) -> None:
