@@ -145,6 +145,7 @@ MANY_DOORS = {
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (9, "to and from each library"),
     "safety.certificates": (9, "a writer an engine, one for each side where it has two, and one of other coordinates"),
+    "safety.search": (6, "whom to ask next, and with what effort; and of limits that move, of what problem"),
     "safety.engines": (20, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
     "reach.sets": (7, "tubes, requirements, and directions for the certificate"),

@@ -280,6 +280,7 @@ def problem_data(problem: Problem) -> dict[str, Any]:
     CertificateError
         If certificates do not state such problems.
     """
+    refuse_moving_limits(problem)
     system, held = problem.system, problem.hold is not None
     tape = system.dynamics if held else problem.closed_loop
     continuous = system.time == "continuous"
