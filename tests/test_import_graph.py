@@ -72,7 +72,8 @@ quadratic.setting
 quadratic.steps
 quadratic
 safety.answers safety.falsification
-safety.engines safety.starts safety.first_exits
+safety.engines safety.starts
+safety.first_exits
 safety.certificates
 safety.portfolio
 safety.certificate

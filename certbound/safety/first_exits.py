@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -21,11 +21,14 @@ from certbound.checks import instance, vector
 from certbound.display import Shown, rounded
 from certbound.errors import EngineError, InfeasibleError, contained
 from certbound.parallel import alone
-from certbound.problem.goals import check_end
+from certbound.problem.goals import check_end, until
 from certbound.problem.model import sources
 from certbound.problem.problem import Problem
+from certbound.problem.reductions import bring_to_rest
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
+from certbound.safety.answers import EngineAnswer, Request
+from certbound.safety.engines import values_engine
 from certbound.values.charts import Chart
 from certbound.values.continuous import bound_mean_time, chart_slabs_of
 from certbound.values.discrete import chart_failures
@@ -36,6 +39,8 @@ _FEWER = {1.0: 1.4, 0.05: 1.27}  # ratio of a horizon to the next shorter one, w
 _SHORTEST = 40  # horizons
 _RARE = -6.0  # log10 of a probability below which no shorter horizon is looked at
 _HALF = 0.5  # of the time that is left, at most, for the mean by one function
+_TIMES = 5  # where limits move
+_EFFORT = 0.3  # of value functions, for each of them
 _SHARE = 0.004  # cells of discrete time, as `FailureBounds` has them
 
 
@@ -122,10 +127,10 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
     Parameters
     ----------
     problem : Problem
-        One state, limits that stand still over the whole horizon, a model that does not depend on time, and a set of
-        starts.
+        One state, limits that hold over the whole horizon, and a set of starts. Where limits move there is a bound of
+        its own for every time; otherwise they stand still, and the model does not depend on time.
     times : sequence of float, optional
-        Where the curves are wanted; those of the value functions when omitted.
+        Where the curves are wanted; those of the value functions when omitted, a few where limits move.
 
     Returns
     -------
@@ -152,6 +157,8 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
     """
     instance("problem", problem, Problem)
     _check(problem)
+    if any(constraint.region.moving for constraint in problem.constraints):
+        return _within_moving_limits(problem, times)
     mean = _mean_by_function(problem)  # before the curves, which may take all of the time
     try:
         with contained("values"):
@@ -200,8 +207,50 @@ def _check(problem: Problem) -> None:
         raise InfeasibleError("exit times have no bounds for unknown constants; give them values.")
     window = (0.0, float(problem.horizon))
     for constraint in problem.constraints:
-        if constraint.region.moving or constraint.during not in (None, window):
-            raise InfeasibleError(f"exit times need limits that always hold and stand still, not '{constraint.label}'.")
+        if constraint.during not in (None, window):
+            raise InfeasibleError(f"exit times need limits that always hold, not '{constraint.label}'.")
+
+
+def _within_moving_limits(problem: Problem, times: Sequence[float] | None) -> ExitTimes:
+    """One value function for each time, of limits that are brought to rest: the last time comes first."""
+    resting, horizon = bring_to_rest(problem), float(problem.horizon)
+    asked = np.linspace(0.0, horizon, _TIMES + 1)[1:] if times is None else np.unique(vector("times", times))
+    if asked[0] < 0 or asked[-1] > horizon:
+        raise ValueError(f"`times` must lie in [0, {horizon:g}], got {asked.tolist()}.")
+    whole = np.unique(np.ceil(asked)) if problem.system.time == "discrete" else asked
+    upper: Curve = []
+    lower: Curve = []
+    refused = "the time was over."
+    try:
+        for s in whole[whole > 0][::-1].tolist():
+            poll(f"exit times up to {s:g}")
+            answer = _by(s, resting.above)
+            refused = answer.reason
+            upper += [(s, _power(answer.log10_delta, up=True), 1.0)] if answer.applicable else []
+            answer = answer if resting.exact else _by(s, resting.below)
+            least = answer.log10_lower if answer.applicable else None
+            lower += [] if least is None else [(s, _power(least, up=False), 0.0)]
+    except OutOfTime:
+        if not upper and not lower:
+            raise
+    if not upper and not lower:
+        raise InfeasibleError(f"exit times could not be bounded: {refused}")
+    grid = np.unique([0.0, *whole.tolist(), horizon])
+    above, below = _above(upper, grid), _below(lower, grid, 1)
+    mean, _ = _means(problem, grid, above, np.zeros(len(grid)), 0.0)
+    found = ExitTimes(problem=problem, times=grid, lower=below, upper=above, mean_lower=mean, mean_upper=None)
+    if times is None:
+        return found
+    ends = np.array([found.at(float(s)) for s in asked])
+    return replace(found, times=asked, lower=ends[:, 0], upper=ends[:, 1])
+
+
+def _by(s: float, problem: Problem | None) -> EngineAnswer:
+    """What value functions say of failing by a time; nothing where there is no problem."""
+    if problem is None:
+        return EngineAnswer(applicable=False, reason="nothing is left to be safe in.")
+    with contained("values"):
+        return values_engine(until(problem, s), Request(effort=_EFFORT))
 
 
 def _continuous(problem: Problem) -> tuple[Curve, Curve, float]:

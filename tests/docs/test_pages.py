@@ -24,7 +24,8 @@ ELSEWHERE = {"pip", "python3.11", ".", "git", "make", "dask", "jupytext", "mkdoc
 """Programs that the test of a fresh environment runs, or that need a second computer."""
 SLOW = {
     "README.md", "certificate.md", "how-to/certificates.md", "how-to/cluster.md", "how-to/expressions.md",
-    "how-to/moving-limits.md", "how-to/mpc.md", "how-to/networks.md", "how-to/observers.md", "how-to/obstacles.md", "how-to/plug-ins.md",
+    "how-to/moving-limits.md",
+    "how-to/mpc.md", "how-to/networks.md", "how-to/observers.md", "how-to/obstacles.md", "how-to/plug-ins.md",
     "how-to/python-control.md", "how-to/sampled.md", "how-to/speed.md", "how-to/sweeps.md",
     "how-to/toml.md", "tutorial.md",
 }  # fmt: skip

@@ -276,7 +276,7 @@ def test_every_start_of_a_set_counts():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"safe": [cb.Inside(cb.Box([-1.0], [1.0]), during=(0, 1))]}, "limits that always hold and stand still"),
+        ({"safe": [cb.Inside(cb.Box([-1.0], [1.0]), during=(0, 1))]}, "limits that always hold"),
         ({"safe": []}, "need a limit by which paths may leave"),
         ({"initial": cb.GaussianStart([0.0], [[0.01]])}, "need one set of starts"),
         ({"initial": [cb.Box([0.0], [0.1]), cb.Box([0.2], [0.3])]}, "need one set of starts"),

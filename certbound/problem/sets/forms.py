@@ -169,7 +169,7 @@ class Region:
         if self.changing:
             raise InfeasibleError(
                 f"sides of a {self.kind} move with t ({', '.join(self.sides)}), which this does not serve: "
-                "verify_safety, sweeps and simulations do; give sides that rest, or move the centre."
+                "verify_safety, bound_exit_times and simulations do; give sides that rest, or move the centre."
             )
 
     def at(self, t: float) -> Self:
