@@ -33,7 +33,8 @@ def failing(problem: cb.Problem, noise: np.ndarray, horizon: float) -> np.ndarra
     h = 1.0 if discrete else horizon / steps
     gain: Any = (
         (problem.system.fixed_gain if problem.system.gain is None else problem.system.gain)
-        if discrete else problem.system.diffusion
+        if discrete
+        else problem.system.diffusion
     )
     move = compile_numpy(problem.closed_loop)
     x = np.tile(problem.initial.middle, (count, 1))
