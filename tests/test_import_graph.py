@@ -29,7 +29,7 @@ problem.model
 problem.sets problem.noise
 problem.table_laws
 problem.adapters problem.networks
-problem.signals
+problem.signals problem.filters
 problem.systems
 problem.observers
 problem.loops

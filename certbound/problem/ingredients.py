@@ -10,6 +10,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.checks import frozen, nearest, number, positive_definite, vector
+from certbound.problem.filters import started
 from certbound.problem.model import Tape
 from certbound.problem.random_constants import Random
 from certbound.problem.sets import Box, GaussianStart, Region, StartUnion
@@ -93,8 +94,36 @@ def check_dimension(name: str, region: Any, dimension: int) -> None:
         )
 
 
-def checked_start(value: Any, dimension: int) -> Any:
-    """A set of starts, a random start, or the union of several sets."""
+def checked_start(value: Any, system: System) -> Any:
+    """A set of starts, a random start, or the union of several sets; of a system with filters perhaps without theirs."""
+    n, own = system.dimension, system.own_dimension
+    given = _dimension_of(value) if system.filters else n
+    if given not in (own, n, None):
+        raise ValueError(
+            f"`initial` must have {own} entries, or {n} with those of the filters ({', '.join(system.states[own:])}), "
+            f"got {given}."
+        )
+    if given != own or own == n:
+        return _checked_start(value, n)
+    return started(_checked_start(value, own), system.filters, ends_of(system.inputs, system.input_names))
+
+
+def _dimension_of(value: Any) -> int | None:
+    """Of a set, a point or a list of sets; None of anything else."""
+    if isinstance(value, list | tuple) and any(isinstance(one, Region | GaussianStart) for one in value):
+        sizes = {size for one in value if (size := _dimension_of(one)) is not None}
+        return sizes.pop() if len(sizes) == 1 else None
+    if isinstance(value, Region | GaussianStart | StartUnion):
+        return value.dimension
+    return None if isinstance(value, Mapping | str) or value is None else int(np.size(value))
+
+
+def ends_of(box: Box | None, names: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """The bounds of signals, by their names."""
+    return {} if box is None else dict(zip(names, zip(box.low.tolist(), box.high.tolist())))
+
+
+def _checked_start(value: Any, dimension: int) -> Any:
     sets = value.members if isinstance(value, StartUnion) else value
     if not isinstance(sets, list | tuple) or not any(isinstance(entry, Region | GaussianStart) for entry in sets):
         return _one_start(value, dimension)
@@ -205,6 +234,7 @@ def described(problem: Any) -> list[tuple[str, str]]:
     signals = {"states": system.states, "inputs": system.input_names, "disturbances": system.disturbance_names}
     found = [(word, ", ".join(map(problem.axis, names))) for word, names in signals.items() if names]
     found += [] if problem.hold is None else [("held for", f"{problem.hold:g} {problem.time_unit}")]
+    found += [("filter", one.describe()) for one in system.filters]
     found += [("drawn", f"{name} = {law.describe()}") for name, law in problem.random.items()]
     starts = ["a point" if start.is_point else type(start).__name__ for start in problem.starts]
     found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))
