@@ -95,7 +95,7 @@ def check_dimension(name: str, region: Any, dimension: int) -> None:
 
 
 def checked_start(value: Any, system: System) -> Any:
-    """A set of starts, a random start, or the union of several sets; of a system with filters perhaps without theirs."""
+    """A set of starts, a random start, or the union of several sets; states of filters may be left out."""
     n, own = system.dimension, system.own_dimension
     given = _dimension_of(value) if system.filters else n
     if given not in (own, n, None):
@@ -105,7 +105,9 @@ def checked_start(value: Any, system: System) -> Any:
         )
     if given != own or own == n:
         return _checked_start(value, n)
-    return started(_checked_start(value, own), system.filters, ends_of(system.inputs, system.input_names))
+    box = system.inputs
+    ends = {} if box is None else dict(zip(system.input_names, np.stack([box.low, box.high], axis=1).tolist()))
+    return started(_checked_start(value, own), system.filters, ends)
 
 
 def _dimension_of(value: Any) -> int | None:
@@ -116,11 +118,6 @@ def _dimension_of(value: Any) -> int | None:
     if isinstance(value, Region | GaussianStart | StartUnion):
         return value.dimension
     return None if isinstance(value, Mapping | str) or value is None else int(np.size(value))
-
-
-def ends_of(box: Box | None, names: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """The bounds of signals, by their names."""
-    return {} if box is None else dict(zip(names, zip(box.low.tolist(), box.high.tolist())))
 
 
 def _checked_start(value: Any, dimension: int) -> Any:

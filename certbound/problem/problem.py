@@ -14,6 +14,7 @@ from certbound.arrays import Array
 from certbound.checks import assign, nearest
 from certbound.display import Shown, amount, ask_later_room, name_text, unit_text
 from certbound.errors import InfeasibleError
+from certbound.problem.filters import check_used
 from certbound.problem.ingredients import (
     check_dimension,
     checked_cost,
@@ -28,7 +29,6 @@ from certbound.problem.ingredients import (
     described,
     samples_of,
 )
-from certbound.problem.filters import check_used
 from certbound.problem.model import Tape, rounded_comparison, sources, substitute, trace
 from certbound.problem.sets import (
     Box,

@@ -30,9 +30,9 @@ from certbound.problem.signals import diffusion_of, signal_box, signal_names, st
 class System:
     """What continuous and discrete time share: names of the signals, and where u and d live.
 
-    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,). The states of ``filters``
-    are the last ones. ``turn`` is T where the system is that of y = T x and ``states`` name x: what is said of limits is
-    said of x then (`said_of`).
+    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,). The last states are
+    those of ``filters``. ``turn`` is T where the system is that of y = T x and ``states`` name x: what is said of limits
+    is said of x then (`said_of`).
     """
 
     states: tuple[str, ...]
@@ -140,8 +140,8 @@ class ContinuousSystem(System):
     input_names, disturbance_names : sequence of str, optional
         Names; u1, u2, ... and d1, d2, ... when omitted (u and d alone).
     filters : sequence of Filter, optional
-        Coloured noise and lags of inputs. Their states stand behind ``states``, and x holds them all; f and ``diffusion``
-        have no rows for them.
+        Coloured noise and lags of inputs. Their states stand behind ``states``, and x holds them all; f and
+        ``diffusion`` have no rows for them.
 
     Raises
     ------

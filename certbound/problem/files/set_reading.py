@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from certbound.checks import located
 from certbound.problem import sets
 from certbound.problem.files.reader import Reader
 from certbound.problem.files.schema import Constraint, Part, PolygonTable, Start
+from certbound.problem.filters import started
 
 
 class SetReader(Reader):
@@ -27,9 +28,8 @@ class SetReader(Reader):
         pairs, coordinates = self.by_state(table, where)
         indices = range(len(self.states)) if coordinates is None else coordinates
         ends = [self.array(pair, f"{where}.{self.states[k]}") for k, pair in zip(indices, pairs)]
-        if missing is None and len(ends) != len(self.states):
-            absent = [name for k, name in enumerate(self.states) if k not in indices]
-            raise ValueError(f"`{where}` must bound every state, {', '.join(absent)} is missing.")
+        if missing is None and coordinates is not None:
+            self._complete(coordinates, where)
         low, high = np.full(len(self.states), -np.inf), np.full(len(self.states), np.inf)
         for index, pair in zip(indices, ends):
             if pair[0] > pair[1]:
@@ -37,6 +37,8 @@ class SetReader(Reader):
                 got = f"{pair[0]:g} > {pair[1]:g}"
                 raise ValueError(f"`{where}.{state}` must be [low, high], got {got}; swap the two.")
             low[index], high[index] = pair
+        if missing is None:
+            low, high = low[: len(ends)], high[: len(ends)]  # without the states of filters, which stand behind
         return sets.Box(low, high, center=center)
 
     def starts(self, tables: Start | list[Start]) -> Any:
@@ -50,8 +52,7 @@ class SetReader(Reader):
         where = f"{where}.{table.chosen}"
         match table.chosen:
             case "point":
-                values, coordinates = self.by_state(table.point, where)
-                return self.array(self._ordered(values, coordinates, where), where)
+                return self.point(*self.by_state(table.point, where), where)
             case "box":
                 return self.box(table.box, where, None)
             case "gaussian":
@@ -74,14 +75,24 @@ class SetReader(Reader):
             return replace(region, center=region.center[order], coordinates=None, **shape)
         return region
 
-    def _ordered(self, values: list[Any], coordinates: tuple[int, ...] | None, where: str) -> list[Any]:
+    def point(self, values: list[Any], coordinates: tuple[int, ...] | None, where: str) -> Any:
+        """A point of all states, or of all but those of filters; some of these filters may have theirs."""
         if coordinates is None:
-            return values
-        self._complete(coordinates, where)
-        return [values[coordinates.index(k)] for k in range(len(values))]
+            return self.array(values, where)
+        given = dict(zip((self.states[k] for k in coordinates), self.array(values, where)))
+        fixed = [one for one in self.filters if given.keys() & set(one.states)]
+        self._complete(coordinates, where, [name for one in fixed for name in one.states])
+        own = [given.pop(name) for name in self.own]
+        if len(fixed) == len(self.filters):
+            return own + [given[name] for name in self.states[len(own) :]]
+        ends = {name: self.array(pair, f"inputs.{name}") for name, pair in self.spec.inputs.items()}
+        return started(sets.Box(own, own), self.filters, ends, given)
 
-    def _complete(self, coordinates: tuple[int, ...], where: str) -> None:
-        absent = [name for k, name in enumerate(self.states) if k not in coordinates]
+    def _complete(self, coordinates: tuple[int, ...], where: str, filtered: Sequence[str] | None = None) -> None:
+        """Refuse to do without a state; those of filters may all be left out, or all but the ``filtered`` ones."""
+        only_own = all(k < len(self.own) for k in coordinates)
+        wanted = self.own if only_own else self.states if filtered is None else (*self.own, *filtered)
+        absent = [name for name in wanted if self.states.index(name) not in coordinates]
         if absent:
             raise ValueError(f"`{where}` must give every state, {', '.join(absent)} is missing.")
 
@@ -99,7 +110,7 @@ class SetReader(Reader):
                 fields["normal"][chosen] = self.array(values, place)
             elif isinstance(value, list):
                 read = self.matrix if any(isinstance(row, list) for row in value) else self.array
-                fields[name] = read(value, place)
+                fields[name] = self.widened(read(value, place), 1) if name == "A" else read(value, place)
             else:
                 fields[name] = self.number(value, place)
         with located(where, fields):
@@ -132,7 +143,7 @@ class SetReader(Reader):
 
     def polygon(self, table: PolygonTable, where: str, *, outward: bool) -> sets.Polytope:
         vertices: Any = table.vertices
-        names = list(vertices) if isinstance(vertices, dict) else self.states
+        names = list(vertices) if isinstance(vertices, dict) else self.own
         if len(names) != 2 or not set(names) <= set(self.states):
             raise ValueError(f"`{where}.vertices` must give two of the states {', '.join(self.states)} by name.")
         rows = list(vertices.values()) if isinstance(vertices, dict) else vertices

@@ -47,9 +47,9 @@ class Filter:
         "band": two-sided spectral density S of the white noise, whose correlation is S times Dirac's delta (a diffusion
         g has S = g^2); not negative. A one-sided density in cycles per time is 2 S, one in radians per time S / pi.
     low, high : float
-        "band": frequencies in radians per time, 0 <= low < high, at which half of S is left. The filter is Butterworth's
-        of first order: the density is S at sqrt(low high), the variance S (high - low) / 2. Of low = 0 a low-pass is
-        left.
+        "band": frequencies in radians per time, 0 <= low < high, at which half of S is left. The filter is that of
+        Butterworth, of first order: the density is S at sqrt(low high), the variance S (high - low) / 2. Of low = 0 a
+        low-pass is left.
     input : str, optional
         "actuator": the input that it follows; may be left out where the system has one.
 
@@ -61,8 +61,8 @@ class Filter:
     Examples
     --------
     >>> gust = Filter("dryden", state="gust", std=1.5, length=200, speed=50, axis="w")
-    >>> gust.states, gust.covariance.round(3).tolist()
-    (('gust', 'gust_2'), [[2.25, 0.562], [0.562, 0.562]])
+    >>> gust.states, gust.covariance.round(2).tolist()
+    (('gust', 'gust_2'), [[2.25, 0.56], [0.56, 0.56]])
     """
 
     kind: str
@@ -111,6 +111,10 @@ class Filter:
             rule = "not be negative" if name in ("std", "density", "low") else "be positive"
             raise ValueError(f"`{name}` must {rule}, got {found:g}.")
         return found
+
+    def __repr__(self) -> str:
+        given = {name: value for name, value in self.data().items() if name != "kind"}
+        return f"Filter({self.kind!r}, {', '.join(f'{name}={value!r}' for name, value in given.items())})"
 
     @property
     def _time(self) -> float:
@@ -183,8 +187,8 @@ def _von_karman(one: Filter) -> Shape:
     """Rational functions whose squares are close to the spectra of MIL-F-8785C, 3.7.1.1, up to their factors.
 
     (1 + .25 s) / (1 + 1.357 s + .1987 s^2) along the flight, and across it (1 + 2.7478 s + .3398 s^2) /
-    (1 + 2.9958 s + 1.9754 s^2 + .1539 s^3), the coefficients that flight simulation uses (MathWorks, Aerospace Blockset,
-    Von Karman Wind Turbulence Model (Continuous)). There their variances are .969 and .962 of std^2, as they have too
+    (1 + 2.9958 s + 1.9754 s^2 + .1539 s^3), the coefficients that flight simulation uses (MathWorks, Aerospace
+    Blockset, Von Karman Wind Turbulence Model (Continuous)). There their variances are .969 and .962 of std^2, as they have too
     little of high frequencies; here they are scaled to std^2.
     """
     num, den = _KARMAN["u" if one.axis == "u" else "v"]
@@ -213,4 +217,3 @@ KINDS = {
     "actuator": _Kind(wants=("time",), may=("input",), shape=None),
 }
 """Every kind of filter, and what it is stated by."""
-

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -48,8 +49,8 @@ def beside(own: Tape, filters: Sequence[Filter], inputs: Sequence[str], time: st
 def _lag(one: Filter, time: str) -> Array:
     """What an actuator makes of its state and its input, which is held over a step in discrete time."""
     if time == "continuous":
-        return np.array([[-1.0, 1.0]]) / one.time
-    return np.array([[np.exp(-1 / one.time), -np.expm1(-1 / one.time)]])
+        return np.array([[-1.0 / one.time, 1.0 / one.time]])
+    return np.array([[math.exp(-1 / one.time), -math.expm1(-1 / one.time)]])
 
 
 def _followed(one: Filter, inputs: Sequence[str]) -> str:
@@ -119,7 +120,9 @@ def law_beside(law: Law | None, filters: Sequence[Filter]) -> Law:
 
 
 def started(
-    start: Any, filters: Sequence[Filter], inputs: Mapping[str, tuple[float, float]],
+    start: Any,
+    filters: Sequence[Filter],
+    inputs: Mapping[str, Sequence[float]],
     fixed: Mapping[str, float] | None = None,
 ) -> Any:
     """A start of the system's own states and, independent of it, of its filters' behind.
@@ -131,7 +134,7 @@ def started(
     filters : sequence of Filter
         What stands behind.
     inputs : mapping
-        Ends of the inputs, by their names.
+        The two ends of each input, by its name.
     fixed : mapping, optional
         Values of filters' states that do not start stationary, by their names.
 
@@ -159,8 +162,8 @@ def started(
         return _independent(start, mean, blocks)
     if not isinstance(start, Box):
         raise ValueError(
-            f"`initial` must be a point, a box or normal beside filters, got a {type(start).__name__}; give it by a box, "
-            f"or over all states, with {', '.join(name for one in filters for name in one.states)}."
+            f"`initial` must be a point, a box or normal beside filters, got a {type(start).__name__}; give a box, or "
+            f"the set over all states, with {', '.join(name for one in filters for name in one.states)}."
         )
     return Box([*start.low, *mean], [*start.high, *mean])
 
@@ -171,8 +174,8 @@ def _stationary(start: Any, mean: list[float], filters: Sequence[Filter], blocks
     if not isinstance(start, GaussianStart):
         names = [name for one, block in zip(filters, blocks) for name in one.states if block.any()]
         raise ValueError(
-            f"`initial` must be a point or normal where filters start stationary, got a {type(start).__name__}; make it "
-            f"normal, or give it over all states: {', '.join(names)} then start there."
+            f"`initial` must be a point or normal where filters start stationary, got a {type(start).__name__}; make "
+            f"it normal, or give it over all states: {', '.join(names)} then start there."
         )
     return _independent(start, mean, blocks)
 
@@ -187,7 +190,7 @@ def _independent(start: GaussianStart, mean: list[float], blocks: list[Array]) -
     return GaussianStart([*start.mean, *mean], covariance)
 
 
-def _check_rest(one: Filter, inputs: Mapping[str, tuple[float, float]]) -> None:
+def _check_rest(one: Filter, inputs: Mapping[str, Sequence[float]]) -> None:
     name = _followed(one, list(inputs))
     low, high = inputs[name]
     if not low <= 0 <= high:
@@ -202,7 +205,7 @@ def check_used(filters: Sequence[Filter], first: int, read: set[int]) -> None:
     for one in filters:
         if not read & set(range(first, first + len(one.states))):
             raise ValueError(
-                f"`filters` must not hold {one.state!r}, which nothing uses; write {one.state!r} in the dynamics, or leave "
-                "it out."
+                f"`filters` must not hold {one.state!r}, which nothing uses; write {one.state!r} in the dynamics, or "
+                "leave it out."
             )
         first += len(one.states)

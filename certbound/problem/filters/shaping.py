@@ -1,7 +1,7 @@
 """State equations of shaping filters, each driven by one white noise, whose first state is the output.
 
-A filter is stated by H(s) = k N(s)/D(s) in units of its own time: N and D have the leading coefficient 1, N is one degree
-lower, and its zeros -z_i are real, distinct and not positive. By partial fractions
+A filter is stated by H(s) = k N(s)/D(s) in units of its own time: N and D have the leading coefficient 1, N is one
+degree lower, and its zeros -z_i are real, distinct and not positive. By partial fractions
 
     D(s)/N(s) = s + c + sum_i r_i / (s + z_i),
 
@@ -9,8 +9,8 @@ so that the output w of H(s) dW/dt obeys, with y_i = z_i w / (s + z_i), the outp
 
     dw = -(c w + sum_i (r_i/z_i) y_i) dt + k dW,    dy_i = z_i (w - y_i) dt,
 
-where a zero z = 0 gives dy = q w dt, q = sqrt(r), and q y in place of (r/z) y. So w is a state, and noise enters no other.
-The stationary covariance P is the solution of A P + P A' + B B' = 0; k is such that the variance of w is 1.
+where a zero z = 0 gives dy = q w dt, q = sqrt(r), and q y in place of (r/z) y. So w is a state, and noise enters no
+other. The stationary covariance P is the solution of A P + P A' + B B' = 0; k is such that the variance of w is 1.
 """
 
 from __future__ import annotations
@@ -37,15 +37,16 @@ class Shape:
     def scaled(self, std: float, time: float) -> Shape:
         """The same filter for a standard deviation of the output and a unit of time."""
         return Shape(
-            rate=frozen(self.rate / time), noise=frozen(self.noise * (std / np.sqrt(time))),
+            rate=frozen(self.rate / time),
+            noise=frozen(self.noise * (std / np.sqrt(time))),
             covariance=frozen(self.covariance * std**2),
         )
 
     def sampled(self) -> tuple[Array, Array]:
         """F and G, shapes (k, k), of the values at 0, 1, 2, ...: y+ = F y + G v with v standard normal.
 
-        F = exp(A), and G G' = Q is the integral of exp(A s) B B' exp(A' s) over [0, 1]: by one exponential for a small part
-        of the step (Van Loan 1978), then by doubling, Q <- Q + F Q F', F <- F F.
+        F = exp(A), and G G' = Q is the integral of exp(A s) B B' exp(A' s) over [0, 1]: by one exponential for a small
+        part of the step (Van Loan 1978), then by doubling, Q <- Q + F Q F', F <- F F.
         """
         from scipy.linalg import expm
 
