@@ -31,8 +31,8 @@ class System:
     """What continuous and discrete time share: names of the signals, and where u and d live.
 
     ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,). The last states are
-    those of ``filters``. ``turn`` is T where the system is that of y = T x and ``states`` name x: what is said of limits
-    is said of x then (`said_of`).
+    those of ``filters``. ``turn`` is T where the system is that of y = T x and ``states`` name x: what is said of
+    limits is said of x then (`said_of`).
     """
 
     states: tuple[str, ...]

@@ -117,7 +117,8 @@ class _ProblemReader(SetReader):
             raise ValueError(
                 "`noise` must hold `diffusion` alone in continuous time, a matrix with "
                 f"{len(self.own)} rows, and [[noise.filter]], got {', '.join(extra) or 'nothing'}; write "
-                "`diffusion = [[...]]`, a row for every state and a column for every Brownian motion: laws and `matrix` are of discrete time."
+                "`diffusion = [[...]]`, a row for every state and a column for every Brownian motion: laws and `matrix` "
+                "are of discrete time."
             )
         value = table.diffusion
         if isinstance(value, dict):

@@ -188,8 +188,8 @@ def _von_karman(one: Filter) -> Shape:
 
     (1 + .25 s) / (1 + 1.357 s + .1987 s^2) along the flight, and across it (1 + 2.7478 s + .3398 s^2) /
     (1 + 2.9958 s + 1.9754 s^2 + .1539 s^3), the coefficients that flight simulation uses (MathWorks, Aerospace
-    Blockset, Von Karman Wind Turbulence Model (Continuous)). There their variances are .969 and .962 of std^2, as they have too
-    little of high frequencies; here they are scaled to std^2.
+    Blockset, Von Karman Wind Turbulence Model (Continuous)). There their variances are .969 and .962 of std^2, as they
+    have too little of high frequencies; here they are scaled to std^2.
     """
     num, den = _KARMAN["u" if one.axis == "u" else "v"]
     zeros = sorted(-root.real for root in np.roots(num))
