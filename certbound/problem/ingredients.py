@@ -10,7 +10,6 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.checks import frozen, nearest, number, positive_definite, vector
-from certbound.problem.filters import started
 from certbound.problem.model import Tape
 from certbound.problem.random_constants import Random
 from certbound.problem.sets import Box, GaussianStart, Region, StartUnion
@@ -107,7 +106,7 @@ def checked_start(value: Any, system: System) -> Any:
         return _checked_start(value, n)
     box = system.inputs
     ends = {} if box is None else dict(zip(system.input_names, np.stack([box.low, box.high], axis=1).tolist()))
-    return started(_checked_start(value, own), system.filters, ends)
+    return system.filters.start(_checked_start(value, own), ends)
 
 
 def _dimension_of(value: Any) -> int | None:
@@ -231,7 +230,7 @@ def described(problem: Any) -> list[tuple[str, str]]:
     signals = {"states": system.states, "inputs": system.input_names, "disturbances": system.disturbance_names}
     found = [(word, ", ".join(map(problem.axis, names))) for word, names in signals.items() if names]
     found += [] if problem.hold is None else [("held for", f"{problem.hold:g} {problem.time_unit}")]
-    found += [("filter", one.describe()) for one in system.filters]
+    found += [("filter", one.describe()) for one in system.filters.members]
     found += [("drawn", f"{name} = {law.describe()}") for name, law in problem.random.items()]
     starts = ["a point" if start.is_point else type(start).__name__ for start in problem.starts]
     found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))

@@ -14,7 +14,6 @@ from certbound.arrays import Array
 from certbound.checks import assign, nearest
 from certbound.display import Shown, amount, ask_later_room, name_text, unit_text
 from certbound.errors import InfeasibleError
-from certbound.problem.filters import check_used
 from certbound.problem.ingredients import (
     check_dimension,
     checked_cost,
@@ -159,7 +158,7 @@ class Problem(Shown):
         if self.hold is None and (self.plan is not None or self.system.inputs is None):
             assign(self, _closed_loop=self._closed())
         self._refuse_rounding()
-        check_used(self.system.filters, self.system.own_dimension, self._read())
+        self.system.filters.check_used(self.system.own_dimension, self._read())
 
     def _read(self) -> set[int]:
         """The states that the system's own dynamics, the noise, the plan or a limit depends on."""

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
-from certbound.checks import assign, frozen, matrix, vector
+from certbound.checks import assign, frozen, matrix, names, vector
 from certbound.errors import InfeasibleError
 from certbound.problem import table_laws  # noqa: F401  (its laws enter the list of laws)
 from certbound.problem.adapters import import_control, is_control_system, linear_inputs, read_model, symbol_names
-from certbound.problem.filters import Filter, beside, checked_filters, filter_states, law_beside, noise_beside
+from certbound.problem.filters import Filter, Filters
 from certbound.problem.model import Tape
 from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
@@ -41,7 +41,7 @@ class System:
     disturbance: Box | None
     disturbance_names: tuple[str, ...]
     dynamics: Tape
-    filters: tuple[Filter, ...] = field(default=(), init=False)
+    filters: Filters = field(default=Filters(), init=False)
     turn: Array | None = field(default=None, init=False)
 
     time: ClassVar[str]
@@ -58,7 +58,7 @@ class System:
     @property
     def own_dimension(self) -> int:
         """Number of states that are not those of filters."""
-        return self.dimension - sum(len(one.states) for one in self.filters)
+        return self.dimension - len(self.filters)
 
     @property
     def noise_dimension(self) -> int:
@@ -72,7 +72,7 @@ class System:
         return "<" + "; ".join(parts) + ">"
 
     def _common(self, f: Any, states: Any, filters: Any, options: dict[str, Any]) -> None:
-        assign(self, filters=checked_filters(filters))
+        assign(self, filters=Filters(filters))
         imported = import_control(f, self.time) if is_control_system(f) else None
         if imported is not None:
             if self.filters:
@@ -87,7 +87,7 @@ class System:
         if states is None:
             raise TypeError("`states` must be given: a number, or the states' names.")
         own = state_names(states)
-        assign(self, states=(*own, *filter_states(self.filters, own)))
+        assign(self, states=(*own, *names("filters", self.filters.states, own)))
         assign(self, inputs=signal_box("inputs", options["inputs"], "u"))
         assign(self, disturbance=signal_box("disturbance", options["disturbance"], "d"))
         if self.disturbance is not None and not self.disturbance.bounded:
@@ -117,7 +117,7 @@ class System:
                 f"got shape {tape.shape}."
             )
         own = Tape(inputs=inputs, nodes=tape.nodes, outputs=tape.outputs, shape=(n,))
-        return beside(own, self.filters, self.input_names, self.time) if self.filters else own
+        return self.filters.dynamics(own, self.input_names, self.time) if self.filters else own
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -180,7 +180,7 @@ class ContinuousSystem(System):
         self._common(f, states, filters, options)
         own = diffusion_of(diffusion, self.states, rows=self.own_dimension)
         if self.filters:
-            own = noise_beside(None if diffusion is None else own, self.own_dimension, self.filters, self.time)
+            own = self.filters.noise(None if diffusion is None else own, self.own_dimension, self.time)
         assign(self, diffusion=own)
 
     @property
@@ -261,8 +261,8 @@ class DiscreteSystem(System):
         matrix_value = np.eye(n) if noise_matrix is None else noise_matrix
         gain = diffusion_of(matrix_value, self.states, "noise_matrix", rows=n)
         if self.filters:
-            law = law_beside(None if noise is None else law.resolve(gain.shape[1]), self.filters)
-            gain = noise_beside(None if noise is None else gain, n, self.filters, self.time)
+            law = self.filters.law(None if noise is None else law.resolve(gain.shape[1]))
+            gain = self.filters.noise(None if noise is None else gain, n, self.time)
         moves = isinstance(gain, Tape)
         assign(self, gain=gain if moves else None, fixed_gain=frozen(np.full(gain.shape, np.nan)) if moves else gain)
         assign(self, noise=law.resolve(gain.shape[1]))

@@ -14,7 +14,7 @@ from certbound.checks import names as checked_names
 from certbound.problem.files.constants_drawn import read_random
 from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.schema import Specification
-from certbound.problem.filters import Filter, filter_states
+from certbound.problem.filters import Filter, Filters
 from certbound.problem.model import Graph, Network, Tape
 from certbound.problem.networks import network
 
@@ -37,7 +37,7 @@ class Reader:
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
         taken |= set(self.parameters)
         self.filters = self._filters()
-        self.states = (*self.own, *filter_states(self.filters, sorted(taken), "noise.filter"))
+        self.states = (*self.own, *checked_names("noise.filter", self.filters.states, sorted(taken)))
         taken |= set(self.states)
         checked_names("networks", list(spec.networks), taken)
         paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
@@ -45,7 +45,7 @@ class Reader:
         checked_names("definitions", list(spec.definitions), taken | set(self.networks))
         self.random = {name: read_random(table, self.array, f"random.{name}") for name, table in spec.random.items()}
 
-    def _filters(self) -> tuple[Filter, ...]:
+    def _filters(self) -> Filters:
         found = []
         for place, table in enumerate(self.spec.noise.filter if self.spec.noise is not None else []):
             where = f"noise.filter.{place}"
@@ -56,7 +56,7 @@ class Reader:
             }
             with located(where, given):
                 found.append(Filter(**values))
-        return tuple(found)
+        return Filters(found)
 
     def number(self, value: float | str, where: str, *, quoted: bool = False) -> float:
         """A number, or the value of an expression in the parameters; in quotes a mere number only if ``quoted``."""

@@ -60,7 +60,7 @@ class _ProblemReader(SetReader):
         spec = self.spec
         options: dict[str, Any] = {
             "states": self.own,
-            "filters": self.filters,
+            "filters": self.filters.members,
             "inputs": self.signal(spec.inputs, "inputs"),
             "disturbance": self.signal(self.bounds(), "disturbances"),
             "input_names": self.inputs or None,
@@ -117,8 +117,8 @@ class _ProblemReader(SetReader):
             raise ValueError(
                 "`noise` must hold `diffusion` alone in continuous time, a matrix with "
                 f"{len(self.own)} rows, and [[noise.filter]], got {', '.join(extra) or 'nothing'}; write "
-                "`diffusion = [[...]]`, a row for every state and a column for every Brownian motion: laws and `matrix` "
-                "are of discrete time."
+                "`diffusion = [[...]]`, a row for every state and a column for every Brownian motion: laws and "
+                "`matrix` are of discrete time."
             )
         value = table.diffusion
         if isinstance(value, dict):

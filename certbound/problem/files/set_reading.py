@@ -12,7 +12,6 @@ from certbound.checks import located
 from certbound.problem import sets
 from certbound.problem.files.reader import Reader
 from certbound.problem.files.schema import Constraint, Part, PolygonTable, Start
-from certbound.problem.filters import started
 
 
 class SetReader(Reader):
@@ -80,13 +79,13 @@ class SetReader(Reader):
         if coordinates is None:
             return self.array(values, where)
         given = dict(zip((self.states[k] for k in coordinates), self.array(values, where)))
-        fixed = [one for one in self.filters if given.keys() & set(one.states)]
+        fixed = [one for one in self.filters.members if given.keys() & set(one.states)]
         self._complete(coordinates, where, [name for one in fixed for name in one.states])
         own = [given.pop(name) for name in self.own]
-        if len(fixed) == len(self.filters):
+        if len(fixed) == len(self.filters.members):
             return own + [given[name] for name in self.states[len(own) :]]
         ends = {name: self.array(pair, f"inputs.{name}") for name, pair in self.spec.inputs.items()}
-        return started(sets.Box(own, own), self.filters, ends, given)
+        return self.filters.start(sets.Box(own, own), ends, given)
 
     def _complete(self, coordinates: tuple[int, ...], where: str, filtered: Sequence[str] | None = None) -> None:
         """Refuse to do without a state; those of filters may all be left out, or all but the ``filtered`` ones."""

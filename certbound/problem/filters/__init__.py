@@ -3,23 +3,6 @@
 from __future__ import annotations
 
 from certbound.problem.filters.filters import Filter
-from certbound.problem.filters.joined import (
-    beside,
-    check_used,
-    checked_filters,
-    filter_states,
-    law_beside,
-    noise_beside,
-    started,
-)
+from certbound.problem.filters.joined import Filters
 
-__all__ = [
-    "beside",
-    "check_used",
-    "checked_filters",
-    "Filter",
-    "filter_states",
-    "law_beside",
-    "noise_beside",
-    "started",
-]
+__all__ = ["Filter", "Filters"]

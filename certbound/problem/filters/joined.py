@@ -4,46 +4,157 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from certbound.arrays import Array
-from certbound.checks import frozen, names
+from certbound.checks import assign, frozen, names
 from certbound.problem.filters.filters import Filter
 from certbound.problem.model import Graph, Tape
 from certbound.problem.noise import Gaussian, Law
 from certbound.problem.sets import Box, GaussianStart, StartUnion
 
 
-def checked_filters(value: Any) -> tuple[Filter, ...]:
-    """The filters of a system, as a tuple."""
-    found = (value,) if isinstance(value, Filter) else tuple(value) if isinstance(value, Sequence) else value
-    if not isinstance(found, tuple) or not all(isinstance(one, Filter) for one in found):
-        raise TypeError(f"`filters` must be a list of cb.Filter, got {value!r}.")
-    return found
+@dataclass(frozen=True, eq=False)
+class Filters:
+    """The filters of a system, in order: what they put behind each of its parts.
 
-
-def filter_states(filters: Sequence[Filter], taken: Sequence[str] = (), where: str = "filters") -> tuple[str, ...]:
-    """Names of the filters' states, none of which may be taken."""
-    return names(where, [name for one in filters for name in one.states], taken)
-
-
-def beside(own: Tape, filters: Sequence[Filter], inputs: Sequence[str], time: str) -> Tape:
-    """The dynamics ``own`` over t, all states and the other signals, with those of the filters behind.
-
-    ``inputs`` names the inputs that an actuator may follow.
+    Parameters
+    ----------
+    members : Filter or sequence of Filter
+        No two of their states share a name.
     """
-    graph = Graph(own.inputs)
-    nodes = {name: graph.input(slot) for slot, name in enumerate(own.inputs)}
-    outputs: list[int] = own.evaluate(graph.arithmetic(), [nodes[name] for name in own.inputs])
-    for one in filters:
-        if one.shape is None:
-            rows, signals = _lag(one, time), [one.state, _followed(one, inputs)]
-        else:
-            rows, signals = one.shape.rate if time == "continuous" else one.shape.sampled()[0], list(one.states)
-        outputs += [_dot(graph, row, [nodes[name] for name in signals]) for row in rows.tolist()]
-    return graph.tape(outputs, (len(outputs),))
+
+    members: Any = ()
+
+    def __post_init__(self) -> None:
+        given = self.members
+        found = (given,) if isinstance(given, Filter) else tuple(given) if isinstance(given, Sequence) else given
+        if not isinstance(found, tuple) or not all(isinstance(one, Filter) for one in found):
+            raise TypeError(f"`filters` must be a list of cb.Filter, got {given!r}.")
+        assign(self, members=found)
+        names("filters", self.states)
+
+    def __bool__(self) -> bool:
+        return bool(self.members)
+
+    def __len__(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of their states, in order."""
+        return tuple(name for one in self.members for name in one.states)
+
+    def dynamics(self, own: Tape, inputs: Sequence[str], time: str) -> Tape:
+        """The dynamics ``own`` over t, all states and the other signals, with theirs behind.
+
+        ``inputs`` names the inputs that an actuator may follow.
+        """
+        graph = Graph(own.inputs)
+        nodes = {name: graph.input(slot) for slot, name in enumerate(own.inputs)}
+        outputs: list[int] = own.evaluate(graph.arithmetic(), [nodes[name] for name in own.inputs])
+        for one in self.members:
+            if one.shape is None:
+                rows, signals = _lag(one, time), [one.state, _followed(one, inputs)]
+            else:
+                rows, signals = one.shape.rate if time == "continuous" else one.shape.sampled()[0], list(one.states)
+            outputs += [_dot(graph, row, [nodes[name] for name in signals]) for row in rows.tolist()]
+        return graph.tape(outputs, (len(outputs),))
+
+    def noise(self, own: Array | Tape | None, rows: int, time: str) -> Array | Tape:
+        """[[G, 0], [0, B]] of the noise matrix G of the system's own states, if any, and columns for each filter."""
+        blocks = [_noise_of(one, time) for one in self.members]
+        below = np.zeros((sum(len(block) for block in blocks), sum(block.shape[1] for block in blocks)))
+        row = column = 0
+        for block in blocks:
+            below[row : row + len(block), column : column + block.shape[1]] = block
+            row, column = row + len(block), column + block.shape[1]
+        n, m = (rows, 0) if own is None else own.shape
+        shape = (n + len(below), m + below.shape[1])
+        if not isinstance(own, Tape):
+            whole = np.zeros(shape)
+            whole[:n, :m], whole[n:, m:] = np.zeros((n, 0)) if own is None else own, below
+            return frozen(whole if shape[1] else np.zeros((shape[0], 1)))
+        graph = Graph(own.inputs)
+        entries = np.full(shape, graph.const(0.0))
+        inputs = [graph.input(slot) for slot in range(len(own.inputs))]
+        entries[:n, :m] = np.reshape(own.evaluate(graph.arithmetic(), inputs), (n, m))
+        entries[n:, m:] = np.reshape([graph.const(value) for value in below.flat], below.shape)
+        return graph.tape([int(node) for node in entries.flat], shape)
+
+    def law(self, law: Law | None) -> Law:
+        """The law of the noise of a system in discrete time, if any, and of theirs behind."""
+        count = sum(len(one.states) for one in self.members if one.noisy)
+        if law is None:
+            return Gaussian(std=1.0 if count else 0.0)
+        if not count:
+            return law
+        if type(law) is not Gaussian:
+            raise ValueError(
+                f"`noise` must be cb.Gaussian(...) beside filters, which normal noise drives, got {type(law).__name__}; "
+                "in place of the filters give states of their own and one law for all noise."
+            )
+        level = law.level
+        if level != "covariance":
+            return Gaussian(**{level: np.concatenate([getattr(law, level), np.ones(count)])})
+        whole = np.eye(law.dimension + count)
+        whole[: law.dimension, : law.dimension] = law.covariance
+        return Gaussian(covariance=whole)
+
+    def start(self, start: Any, inputs: Mapping[str, Sequence[float]], fixed: Mapping[str, float] | None = None) -> Any:
+        """A start of the system's own states and, independent of it, of theirs behind.
+
+        Parameters
+        ----------
+        start : Region, GaussianStart or StartUnion
+            Of the states that are not the filters'.
+        inputs : mapping
+            The two ends of each input, by its name.
+        fixed : mapping, optional
+            Values of filters' states that do not start stationary, by their names.
+
+        Returns
+        -------
+        Box, GaussianStart or StartUnion
+            A GaussianStart where a filter starts stationary.
+
+        Raises
+        ------
+        ValueError
+            If a filter starts stationary and the start is a set, or 0 is no value of an actuator's input.
+        """
+        given = fixed or {}
+        blocks = [one.covariance * (not set(one.states) <= given.keys()) for one in self.members]
+        mean = [given.get(name, 0.0) for one in self.members for name in one.states]
+        for one in self.members:
+            if not one.noisy and one.state not in given:
+                _check_rest(one, inputs)
+        if any(block.any() for block in blocks):
+            return _stationary(start, mean, self.members, blocks)
+        if isinstance(start, StartUnion):
+            return StartUnion(tuple(self.start(member, inputs, fixed) for member in start.members))
+        if isinstance(start, GaussianStart):
+            return _independent(start, mean, blocks)
+        if not isinstance(start, Box):
+            raise ValueError(
+                f"`initial` must be a point, a box or normal beside filters, got a {type(start).__name__}; give a box, "
+                f"or the set over all states, with {', '.join(self.states)}."
+            )
+        return Box([*start.low, *mean], [*start.high, *mean])
+
+    def check_used(self, first: int, read: set[int]) -> None:
+        """Refuse a filter of which no state is ``read``; ``first`` is the number of the system's own states."""
+        for one in self.members:
+            if not read & set(range(first, first + len(one.states))):
+                raise ValueError(
+                    f"`filters` must not hold {one.state!r}, which nothing uses; write {one.state!r} in the dynamics, "
+                    "or leave it out."
+                )
+            first += len(one.states)
 
 
 def _lag(one: Filter, time: str) -> Array:
@@ -70,102 +181,11 @@ def _dot(graph: Graph, row: Sequence[float], signals: Sequence[int]) -> int:
     return total
 
 
-def noise_beside(own: Array | Tape | None, rows: int, filters: Sequence[Filter], time: str) -> Array | Tape:
-    """[[G, 0], [0, B]] of the noise matrix G of the system's own states, if any, and columns for each filter."""
-    blocks = [_noise_of(one, time) for one in filters]
-    below = np.zeros((sum(len(block) for block in blocks), sum(block.shape[1] for block in blocks)))
-    row = column = 0
-    for block in blocks:
-        below[row : row + len(block), column : column + block.shape[1]] = block
-        row, column = row + len(block), column + block.shape[1]
-    n, m = (rows, 0) if own is None else own.shape
-    shape = (n + len(below), m + below.shape[1])
-    if not isinstance(own, Tape):
-        whole = np.zeros(shape)
-        whole[:n, :m], whole[n:, m:] = np.zeros((n, 0)) if own is None else own, below
-        return frozen(whole if shape[1] else np.zeros((shape[0], 1)))
-    graph = Graph(own.inputs)
-    entries = np.full(shape, graph.const(0.0))
-    inputs = [graph.input(slot) for slot in range(len(own.inputs))]
-    entries[:n, :m] = np.reshape(own.evaluate(graph.arithmetic(), inputs), (n, m))
-    entries[n:, m:] = np.reshape([graph.const(value) for value in below.flat], below.shape)
-    return graph.tape([int(node) for node in entries.flat], shape)
-
-
 def _noise_of(one: Filter, time: str) -> Array:
     """B, shape (k, 1), or in discrete time (k, k); no columns where no noise drives it."""
     if one.shape is None:
         return np.zeros((1, 0))
     return one.shape.noise[:, None] if time == "continuous" else one.shape.sampled()[1]
-
-
-def law_beside(law: Law | None, filters: Sequence[Filter]) -> Law:
-    """The law of the noise of a system in discrete time, if any, and of its filters behind."""
-    count = sum(len(one.states) for one in filters if one.noisy)
-    if law is None:
-        return Gaussian(std=1.0 if count else 0.0)
-    if not count:
-        return law
-    if type(law) is not Gaussian:
-        raise ValueError(
-            f"`noise` must be cb.Gaussian(...) beside filters, which normal noise drives, got {type(law).__name__}; in "
-            "place of the filters give states of their own and one law for all noise."
-        )
-    level = law.level
-    if level != "covariance":
-        return Gaussian(**{level: np.concatenate([getattr(law, level), np.ones(count)])})
-    whole = np.eye(law.dimension + count)
-    whole[: law.dimension, : law.dimension] = law.covariance
-    return Gaussian(covariance=whole)
-
-
-def started(
-    start: Any,
-    filters: Sequence[Filter],
-    inputs: Mapping[str, Sequence[float]],
-    fixed: Mapping[str, float] | None = None,
-) -> Any:
-    """A start of the system's own states and, independent of it, of its filters' behind.
-
-    Parameters
-    ----------
-    start : Region, GaussianStart or StartUnion
-        Of the states that are not the filters'.
-    filters : sequence of Filter
-        What stands behind.
-    inputs : mapping
-        The two ends of each input, by its name.
-    fixed : mapping, optional
-        Values of filters' states that do not start stationary, by their names.
-
-    Returns
-    -------
-    Box, GaussianStart or StartUnion
-        A GaussianStart where a filter starts stationary.
-
-    Raises
-    ------
-    ValueError
-        If a filter starts stationary and the start is a set, or 0 is no value of an actuator's input.
-    """
-    given = fixed or {}
-    blocks = [one.covariance * (not set(one.states) <= given.keys()) for one in filters]
-    mean = [given.get(name, 0.0) for one in filters for name in one.states]
-    for one in filters:
-        if not one.noisy and one.state not in given:
-            _check_rest(one, inputs)
-    if any(block.any() for block in blocks):
-        return _stationary(start, mean, filters, blocks)
-    if isinstance(start, StartUnion):
-        return StartUnion(tuple(started(member, filters, inputs, fixed) for member in start.members))
-    if isinstance(start, GaussianStart):
-        return _independent(start, mean, blocks)
-    if not isinstance(start, Box):
-        raise ValueError(
-            f"`initial` must be a point, a box or normal beside filters, got a {type(start).__name__}; give a box, or "
-            f"the set over all states, with {', '.join(name for one in filters for name in one.states)}."
-        )
-    return Box([*start.low, *mean], [*start.high, *mean])
 
 
 def _stationary(start: Any, mean: list[float], filters: Sequence[Filter], blocks: list[Array]) -> GaussianStart:
@@ -198,14 +218,3 @@ def _check_rest(one: Filter, inputs: Mapping[str, Sequence[float]]) -> None:
             f"`initial` must give {one.state!r}, the lag of {name!r}, where 0 is no value of that, got "
             f"[{low:g}, {high:g}]; give it over all states."
         )
-
-
-def check_used(filters: Sequence[Filter], first: int, read: set[int]) -> None:
-    """Refuse a filter that nothing reads; ``first`` states stand before the filters', ``read`` holds those that are."""
-    for one in filters:
-        if not read & set(range(first, first + len(one.states))):
-            raise ValueError(
-                f"`filters` must not hold {one.state!r}, which nothing uses; write {one.state!r} in the dynamics, or "
-                "leave it out."
-            )
-        first += len(one.states)
