@@ -54,7 +54,7 @@ class Reader:
             values: dict[str, Any] = {
                 name: value if name in texts else self.number(value, f"{where}.{name}") for name, value in given.items()
             }
-            with located(where, given):
+            with located(where, type(table).model_fields):
                 found.append(Filter(**values))
         return Filters(found)
 

@@ -30,7 +30,8 @@ class Filter:
     ----------
     kind : str
         "ou": Ornstein-Uhlenbeck, the correlation is exp(-|s| / time). "dryden" and "von_karman": gusts along an axis
-        of flight, MIL-F-8785C; the latter by rational functions. "band": white noise behind a band-pass. "actuator":
+        of flight, MIL-F-8785C; the latter by rational functions, within 7 % of the spectrum up to the frequencies 13
+        speed / length (axis "u") and 20 speed / length. "band": white noise behind a band-pass. "actuator":
         time * x' = u - x, which is no noise, and starts at 0.
     state : str
         Name of the output.

@@ -95,8 +95,8 @@ class Filters:
             return law
         if type(law) is not Gaussian:
             raise ValueError(
-                f"`noise` must be cb.Gaussian(...) beside filters, which normal noise drives, got {type(law).__name__}; "
-                "in place of the filters give states of their own and one law for all noise."
+                f"`noise` must be cb.Gaussian(...) beside filters, which normal noise drives, got "
+                f"{type(law).__name__}; in place of the filters give states of their own and one law for all noise."
             )
         level = law.level
         if level != "covariance":

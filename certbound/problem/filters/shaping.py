@@ -31,16 +31,21 @@ class Shape:
     """dy = A y dt + B dW with the stationary covariance P; the output is the first state."""
 
     rate: Array  # A, shape (k, k)
-    noise: Array  # B, shape (k,)
+    intensity: float  # B_1^2: the noise enters the output alone
     covariance: Array  # P, shape (k, k)
 
     def scaled(self, std: float, time: float) -> Shape:
         """The same filter for a standard deviation of the output and a unit of time."""
         return Shape(
             rate=frozen(self.rate / time),
-            noise=frozen(self.noise * (std / np.sqrt(time))),
+            intensity=self.intensity * std**2 / time,
             covariance=frozen(self.covariance * std**2),
         )
+
+    @property
+    def noise(self) -> Array:
+        """B, shape (k,)."""
+        return frozen(np.sqrt(self.intensity) * np.eye(len(self.rate))[0])
 
     def sampled(self) -> tuple[Array, Array]:
         """F and G, shapes (k, k), of the values at 0, 1, 2, ...: y+ = F y + G v with v standard normal.
@@ -74,13 +79,12 @@ def shaped(zeros: tuple[float, ...], den: tuple[float, ...]) -> Shape:
         residue = np.polyval(rest, -zero) / np.polyval(slope, -zero)
         speed = zero if zero > 0 else np.sqrt(residue)
         rate[0, place], rate[place, 0], rate[place, place] = -residue / speed, speed, -zero
-    drive = np.eye(size)[0]
-    covariance = _stationary(rate, drive)
-    scale = covariance[0, 0]
+    covariance = _stationary(rate, np.eye(size)[0])
+    scale = float(covariance[0, 0])
     covariance = covariance / scale
     covariance[np.abs(covariance) < _NOISE] = 0.0
     covariance[0, 0] = 1.0
-    return Shape(rate=frozen(rate), noise=frozen(drive / np.sqrt(scale)), covariance=frozen(covariance))
+    return Shape(rate=frozen(rate), intensity=1 / scale, covariance=frozen(covariance))
 
 
 def _stationary(rate: Array, noise: Array) -> Array:
