@@ -347,7 +347,7 @@ def test_a_mean_that_was_proved_in_time_stands_without_curves(monkeypatch):
 def test_the_command_has_a_limit_of_its_own(found, monkeypatch, capsys):
     limits = []
 
-    def asked(problem):
+    def asked(problem, by_limit):
         limits.append(current_watch().limit)
         return found
 
@@ -358,7 +358,7 @@ def test_the_command_has_a_limit_of_its_own(found, monkeypatch, capsys):
 
 
 def test_a_command_whose_time_is_over_before_anything_is_proved_says_so(monkeypatch, capsys):
-    def late(problem):
+    def late(problem, by_limit):
         raise OutOfTime
 
     monkeypatch.setattr(first_exits, "bound_exit_times", late)
