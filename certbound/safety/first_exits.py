@@ -41,7 +41,7 @@ _RARE = -6.0  # log10 of a probability below which no shorter horizon is looked 
 _HALF = 0.5  # of the time that is left, at most, for the mean by one function
 _SHARE = 0.004  # cells of discrete time, as `FailureBounds` has them
 _INTERVALS = {"continuous": 16, "discrete": 64}  # over which the density is told, at most
-_SECONDS = 10.0  # of work for one limit by itself, in discrete time
+_SECONDS = 4.0  # of work for one limit by itself, in discrete time
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -345,18 +345,31 @@ def _density(problem: Problem, grid: Array, above: Array, least: Array) -> Densi
 
 
 def _by_limit(problem: Problem, upper: float, lower: float) -> tuple[LimitBounds, ...]:
-    """Bounds of which limit is met first: between two limits, each with the other one as an end that does not fail."""
+    """Bounds of which limit is met first: between two limits, each with the other one as an end that does not fail.
+
+    From one start, without a disturbance, P(this one) = P(leaving) - P(the other one).
+    """
     names, sides = limits_of(problem), _sides(problem)
-    known: list[dict[tuple[int, int], float]] = [{}, {}]
-    for up, (place, limits) in enumerate(sides or ()):
-        least, most = _first_at(problem, place, sides[1 - up][0], up=bool(up)) if sides else (None, None)
-        known[0] |= {limit: most for limit in limits if most is not None}
-        known[1] |= {limits[0]: least} if len(limits) == 1 and least is not None else {}
-    total, rest = (math.log10(value) if value > 0 else -math.inf for value in (upper, lower))
+    uppers: dict[tuple[int, int], float] = {}
+    lowers: dict[tuple[int, int], float] = {}
+    ends = [] if sides is None else [_first_at(problem, sides[k][0], sides[1 - k][0], up=bool(k)) for k in (0, 1)]
+    plain = problem.fixed_start and problem.system.disturbance is None
+    for k, (least, most) in enumerate(ends):
+        limits = sides[k][1] if sides else []
+        most = min(most, upper * (1 + 1e-12) - ends[1 - k][0] * (1 - 1e-12)) if plain else most
+        uppers |= {limit: _log10(most, up=True) for limit in limits}
+        lowers |= {limits[0]: _log10(least, up=False)} if len(limits) == 1 else {}
+    rest = _log10(lower, up=False)
     return bound_limits(
-        names, max(total * (1 - 1e-14), -1e12), None if rest == -math.inf else rest * (1 + 1e-14),
-        uppers=known[:1], lowers=known[1],
-    )  # fmt: skip
+        names, _log10(upper, up=True), None if rest == -math.inf else rest, uppers=[uppers], lowers=lowers
+    )
+
+
+def _log10(value: float, *, up: bool) -> float:
+    """log10 of a probability, rounded up or down: -inf only downward."""
+    if value <= 0:
+        return -300.0 if up else -math.inf
+    return min(math.log10(value) * (1 - 1e-14) + 1e-14, 0.0) if up else math.log10(value) * (1 + 1e-14) - 1e-14
 
 
 Side = tuple[float, list[tuple[int, int]]]
@@ -381,8 +394,8 @@ def _sides(problem: Problem) -> tuple[Side, Side] | None:
     return (least, [limit for _, limit in low]), (most, [limit for _, limit in high])
 
 
-def _first_at(problem: Problem, place: float, other: float, *, up: bool) -> tuple[float | None, float | None]:
-    """log10 of bounds of P(the state leaves at ``place`` within T, before it leaves at the ``other`` end)."""
+def _first_at(problem: Problem, place: float, other: float, *, up: bool) -> tuple[float, float]:
+    """Bounds of P(the state leaves at ``place`` within T, before it leaves at the ``other`` end); 0 and 1 for none."""
     inside, ends = ((-math.inf, place), (other, math.inf)) if up else ((place, math.inf), (-math.inf, other))
     alone = problem.replace(
         safe=[Inside(Box(*([end] for end in inside)))], domain=Box(*([end] for end in ends)), leaving="ends"
@@ -391,12 +404,12 @@ def _first_at(problem: Problem, place: float, other: float, *, up: bool) -> tupl
         with contained("values"), share_of_time(_HALF if not up else 1.0):
             if isinstance(problem.system, ContinuousSystem):
                 found = bound_exits(alone)
-                return found.lower, found.upper
+                least = 0.0 if found.lower is None else _power(found.lower, up=False)
+                return least, max(_power(found.upper, up=True), 1e-300)
             chain = bound_chain(alone, seconds=_SECONDS)
+            return chain.lower, chain.upper
     except (EngineError, InfeasibleError, OutOfTime):
-        return None, None
-    lower = math.log10(chain.lower) * (1 + 1e-14) if chain.lower > 0 else None
-    return lower, math.log10(max(chain.upper, 1e-300)) * (1 - 1e-14)
+        return 0.0, 1.0
 
 
 def _mean_by_function(problem: Problem) -> tuple[float, float | None] | None:

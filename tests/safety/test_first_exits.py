@@ -308,7 +308,8 @@ def test_the_command_prints_the_curves(tmp_path, capsys):
     save(problem, tmp_path / "walk.toml")
     assert run(["exit-times", str(tmp_path / "walk.toml"), "--json", "--plot", str(tmp_path / "walk.png")]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert list(result) == ["times", "lower", "upper", "mean_lower", "mean_upper", "seconds"]
+    keys = ["times", "lower", "upper", "mean_lower", "mean_upper", "density", "by_limit", "seconds"]
+    assert list(result) == keys
     assert result["upper"][-1] > result["lower"][-1] > 0.5
     assert (tmp_path / "walk.png").stat().st_size > 5000
     assert run(["exit-times", str(tmp_path / "walk.toml")]) == 0
