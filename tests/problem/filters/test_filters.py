@@ -136,11 +136,11 @@ def test_simulated_outputs_have_the_variance_the_correlation_and_the_spectrum(na
     variance, lag = one.covariance[0, 0], 0.2
     seen = np.mean(paths**2, axis=0)
     np.testing.assert_allclose(seen, variance, rtol=6 * np.sqrt(2 / count))
-    apart = 20
+    lags = 20
     from scipy.linalg import expm
 
-    correlation = (expm(one.shape.rate * lag * apart) @ one.covariance)[0, 0]
-    assert np.mean(paths[:, apart:] * paths[:, :-apart]) == pytest.approx(correlation, abs=0.04 * variance)
+    correlation = (expm(one.shape.rate * lag * lags) @ one.covariance)[0, 0]
+    assert np.mean(paths[:, lags:] * paths[:, :-lags]) == pytest.approx(correlation, abs=0.04 * variance)
     times = np.arange(paths.shape[1]) * lag
     for omega in (0.3, 0.7):
         found = np.mean(np.abs(np.trapezoid(paths * np.exp(-1j * omega * times), times, axis=1)) ** 2) / horizon
@@ -300,6 +300,16 @@ def test_faults_in_python_are_told():
         cb.ContinuousSystem(lambda x: x, states=["v"], filters=[ou])
     with pytest.raises(ValueError, match=r"`initial` must have 1 entries, or 2 with those of the filters \(w\), got 3"):
         cb.Problem(plant(ou), initial=[0, 0, 0], safe=[], horizon=1)
+    with pytest.raises(ValueError, match="got a python-control system"):
+        import control
+
+        cb.ContinuousSystem(control.ss([[-1.0]], [[1.0]], [[1.0]], 0), filters=[ou])
+    lag = cb.Filter("actuator", state="f", time=1)
+    lagged = cb.ContinuousSystem(lambda x, f: f, states=["v"], inputs=cb.Box([-1], [1]), filters=[lag])
+    with pytest.raises(ValueError, match="must be a point, a box or normal beside filters, got a Ball"):
+        cb.Problem(lagged, initial=cb.Ball([0], 1), safe=[], horizon=1)
+    two = cb.Problem(lagged, initial=[cb.Box([0], [1]), cb.Box([2], [3])], safe=[], horizon=1)
+    assert [member.high.tolist() for member in two.initial.members] == [[1, 0], [3, 0]]
     with pytest.raises(ValueError, match="got a StartUnion"):
         cb.Problem(plant(ou), initial=[cb.Box([0], [0]), cb.Box([1], [1])], safe=[], horizon=1)
 
