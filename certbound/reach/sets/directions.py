@@ -80,9 +80,10 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
     found = []
     for number, constraint in enumerate(problem.constraints):
         own, needed = number if number < len(problem.safe) else -1, curve.required(constraint.during)
+        by_faces = isinstance(constraint.region.form, Faces) and not constraint.outside
         for place, (label, rows, room) in enumerate(_constraint(constraint, curve, problem.system)):
             asked = np.where(needed, room, np.inf)
-            limit = place if len(limit_names(constraint, problem.system)) > 1 else 0
+            limit = place if by_faces else 0
             found.append(Requirement(label=label, constraint=own, limit=limit, rows=rows, room=asked))
     return found
 
