@@ -177,7 +177,9 @@ def test_verdicts_certificates_and_reports_are_of_the_system_with_its_filters():
     by_hand = cb.verify_safety(loads(BY_HAND), method="linear")
     assert verdict.log10_delta == pytest.approx(by_hand.log10_delta, abs=1e-6)
     assert check_data(parse(certificate_text(problem, verdict)), problem_data(problem)).valid
-    assert "filter ou" in report_page(problem, verdict)
+    page = report_page(problem, verdict)
+    assert "filter ou" in page
+    assert "starts from its stationary law" in page
 
 
 def test_noise_that_depends_on_the_state_keeps_its_columns():
