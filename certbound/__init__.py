@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # what mypy and editors read; a test compares it with the tab
     from certbound.problem.export import export_control as export_control
     from certbound.problem.files import load as load
     from certbound.problem.files import save as save
+    from certbound.problem.filters import Filter as Filter
     from certbound.problem.loops import estimate_loop as estimate_loop
     from certbound.problem.networks import network as network
     from certbound.problem.noise import Bounded as Bounded
@@ -80,6 +81,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _HOME = {
     "problem.systems": "ContinuousSystem DiscreteSystem linear_system from_control",
+    "problem.filters": "Filter",
     "problem.loops": "estimate_loop",
     "problem.random_constants": "Random",
     "problem.noise": "Gaussian Uniform Triangular Rademacher Bounded SubGaussian",

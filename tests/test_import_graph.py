@@ -29,7 +29,7 @@ problem.model
 problem.sets problem.noise
 problem.table_laws
 problem.adapters problem.networks
-problem.signals
+problem.signals problem.filters
 problem.systems
 problem.observers
 problem.loops
@@ -149,7 +149,7 @@ MANY_DOORS = {
     "safety.search": (6, "whom to ask next, and with what effort; and of limits that move, of what problem"),
     "safety.engines": (20, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),
-    "reach.sets": (7, "tubes, requirements, and directions for the certificate"),
+    "reach.sets": (8, "tubes, requirements and their names, and directions for the certificate"),
 }
 """Sub-rooms with more than ``MOST_DOORS`` names in their ``__init__``: how many at most, and why."""
 

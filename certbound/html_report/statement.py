@@ -114,6 +114,14 @@ def _interval(value: Any) -> str:
 
 
 def _noise(noise: Mapping[str, Any], unit: str) -> Iterator[str]:
+    filters, noise = noise.get("filter", []), {key: value for key, value in noise.items() if key != "filter"}
+    for one in filters:
+        rest = {key: value for key, value in one.items() if key not in ("state", "kind")}
+        begins = "0" if one["kind"] == "actuator" else "its stationary law"
+        words = f"which starts from {begins}, unless the start gives its states"
+        yield f"{math(typeset.name(one['state']))}: filter {text(one['kind'])}, {_matrix(rest)}, {words}"
+    if filters and not noise:
+        return
     if "diffusion" in noise:
         yield f"Wiener, in the sense of Ito; diffusion {_matrix(noise['diffusion'])}"
         return

@@ -93,8 +93,33 @@ def check_dimension(name: str, region: Any, dimension: int) -> None:
         )
 
 
-def checked_start(value: Any, dimension: int) -> Any:
-    """A set of starts, a random start, or the union of several sets."""
+def checked_start(value: Any, system: System) -> Any:
+    """A set of starts, a random start, or the union of several sets; states of filters may be left out."""
+    n, own = system.dimension, system.own_dimension
+    given = _dimension_of(value) if system.filters else n
+    if given not in (own, n, None):
+        raise ValueError(
+            f"`initial` must have {own} entries, or {n} with those of the filters ({', '.join(system.states[own:])}), "
+            f"got {given}."
+        )
+    if given != own or own == n:
+        return _checked_start(value, n)
+    box = system.inputs
+    ends = {} if box is None else dict(zip(system.input_names, np.stack([box.low, box.high], axis=1).tolist()))
+    return system.filters.start(_checked_start(value, own), ends)
+
+
+def _dimension_of(value: Any) -> int | None:
+    """Of a set, a point or a list of sets; None of anything else."""
+    if isinstance(value, list | tuple) and any(isinstance(one, Region | GaussianStart) for one in value):
+        sizes = {size for one in value if (size := _dimension_of(one)) is not None}
+        return sizes.pop() if len(sizes) == 1 else None
+    if isinstance(value, Region | GaussianStart | StartUnion):
+        return value.dimension
+    return None if isinstance(value, Mapping | str) or value is None else int(np.size(value))
+
+
+def _checked_start(value: Any, dimension: int) -> Any:
     sets = value.members if isinstance(value, StartUnion) else value
     if not isinstance(sets, list | tuple) or not any(isinstance(entry, Region | GaussianStart) for entry in sets):
         return _one_start(value, dimension)
@@ -205,6 +230,7 @@ def described(problem: Any) -> list[tuple[str, str]]:
     signals = {"states": system.states, "inputs": system.input_names, "disturbances": system.disturbance_names}
     found = [(word, ", ".join(map(problem.axis, names))) for word, names in signals.items() if names]
     found += [] if problem.hold is None else [("held for", f"{problem.hold:g} {problem.time_unit}")]
+    found += [("filter", one.describe()) for one in system.filters.members]
     found += [("drawn", f"{name} = {law.describe()}") for name, law in problem.random.items()]
     starts = ["a point" if start.is_point else type(start).__name__ for start in problem.starts]
     found.append(("start", starts[0] if len(starts) == 1 else f"one of {', '.join(starts)}"))

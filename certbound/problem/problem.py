@@ -28,7 +28,7 @@ from certbound.problem.ingredients import (
     described,
     samples_of,
 )
-from certbound.problem.model import Tape, rounded_comparison, substitute, trace
+from certbound.problem.model import Tape, rounded_comparison, sources, substitute, trace
 from certbound.problem.sets import (
     Box,
     GaussianStart,
@@ -145,7 +145,7 @@ class Problem(Shown):
         assign(self, safe=self._constraints())
         assign(self, domain=self._domain())
         assign(self, reach=self._target())
-        assign(self, initial=checked_start(self.initial, self.system.dimension))
+        assign(self, initial=checked_start(self.initial, self.system))
         constants = self.system.disturbance_names
         assign(self, parameters=dict(self.parameters or {}), unknown=checked_unknown(self.unknown, constants))
         assign(self, random=checked_random(self.random, constants, self.unknown))
@@ -160,6 +160,19 @@ class Problem(Shown):
         if self.hold is None and (self.plan is not None or self.system.inputs is None):
             assign(self, _closed_loop=self._closed())
         self._refuse_rounding()
+        self.system.filters.check_used(self.system.own_dimension, self._read())
+
+    def _read(self) -> set[int]:
+        """The states that the system's own dynamics, the noise, the plan or a limit depends on."""
+        system, n = self.system, self.system.own_dimension
+        noise = system.diffusion if isinstance(system, ContinuousSystem) else system.gain
+        own = Tape(inputs=system.dynamics.inputs, nodes=system.dynamics.nodes, outputs=system.dynamics.outputs[:n],
+                   shape=(n,))
+        tapes = [tape for tape in (own, noise, self.plan) if isinstance(tape, Tape)]
+        found = {slot - 1 for tape in tapes for slot in set[int]().union(*sources(tape))}
+        for constraint in (*self.safe, *([] if self.reach is None else [self.reach])):
+            found |= constraint.region.touched(system.dimension)
+        return found
 
     @property
     def constraints(self) -> tuple[Inside, ...]:

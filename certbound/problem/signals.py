@@ -52,8 +52,7 @@ def signal_names(
     return (symbol,) if count == 1 else tuple(f"{symbol}{k}" for k in range(1, count + 1))
 
 
-def _noise_matrix(name: str, value: Any, states: Sequence[str]) -> Array:
-    n = len(states)
+def _noise_matrix(name: str, value: Any, n: int) -> Array:
     cure = "; write np.diag([...]) for independent noise on every state" if isinstance(value, Mapping) else ""
     try:
         raw = np.asarray("" if cure else value)
@@ -75,13 +74,18 @@ def _noise_matrix(name: str, value: Any, states: Sequence[str]) -> Array:
     return matrix(name, array, rows=n)
 
 
-def diffusion_of(value: Any, states: Sequence[str], name: str = "diffusion") -> Array | Tape:
-    """The matrix of the noise: numbers where it is constant, else a tape over t and the states, with two axes."""
-    n = len(states)
+def diffusion_of(
+    value: Any, states: Sequence[str], name: str = "diffusion", *, rows: int | None = None
+) -> Array | Tape:
+    """The matrix of the noise: numbers where it is constant, else a tape over t and the states, with two axes.
+
+    ``rows`` is their number where not every state has one.
+    """
+    n = len(states) if rows is None else rows
     if value is None:
         return frozen(np.zeros((n, 1)))
     if not callable(value) and not isinstance(value, Tape) and not is_symbolic(value):
-        return _noise_matrix(name, value, states)
+        return _noise_matrix(name, value, n)
     tape = value if isinstance(value, Tape) else read_model(value, {"t": ["t"], "x": states}, matrix=True)
     if tape.inputs != ("t", *states):
         raise ValueError(f"`{name}` must be a tape over {('t', *states)}, got {tape.inputs}.")
@@ -95,5 +99,5 @@ def diffusion_of(value: Any, states: Sequence[str], name: str = "diffusion") -> 
         raise ValueError(f"`{name}` must return {n} rows (one per state), got shape {shape}.")
     if all(node.op != "input" for node in tape.nodes):
         with np.errstate(all="ignore"):
-            return matrix(name, compile_numpy(tape)(*np.zeros(n + 1)).reshape(shape), rows=n)
+            return matrix(name, compile_numpy(tape)(*np.zeros(1 + len(states))).reshape(shape), rows=n)
     return Tape(inputs=tape.inputs, nodes=tape.nodes, outputs=tape.outputs, shape=shape)

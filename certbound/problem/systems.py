@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certbound.arrays import Array
-from certbound.checks import assign, frozen, matrix, vector
+from certbound.checks import assign, frozen, matrix, names, vector
 from certbound.errors import InfeasibleError
 from certbound.problem import table_laws  # noqa: F401  (its laws enter the list of laws)
 from certbound.problem.adapters import import_control, is_control_system, linear_inputs, read_model, symbol_names
+from certbound.problem.filters import Filter, Filters
 from certbound.problem.model import Tape
 from certbound.problem.noise import Gaussian, Law, known_laws
 from certbound.problem.sets import Box
@@ -29,8 +30,9 @@ from certbound.problem.signals import diffusion_of, signal_box, signal_names, st
 class System:
     """What continuous and discrete time share: names of the signals, and where u and d live.
 
-    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,). ``turn`` is T where the
-    system is that of y = T x and ``states`` name x: what is said of limits is said of x then (`said_of`).
+    ``dynamics`` is f, over ``("t", *states, *input_names, *disturbance_names)``, of shape (n,). The last states are
+    those of ``filters``. ``turn`` is T where the system is that of y = T x and ``states`` name x: what is said of
+    limits is said of x then (`said_of`).
     """
 
     states: tuple[str, ...]
@@ -39,6 +41,7 @@ class System:
     disturbance: Box | None
     disturbance_names: tuple[str, ...]
     dynamics: Tape
+    filters: Filters = field(default=Filters(), init=False)
     turn: Array | None = field(default=None, init=False)
 
     time: ClassVar[str]
@@ -53,6 +56,11 @@ class System:
         return len(self.states)
 
     @property
+    def own_dimension(self) -> int:
+        """Number of states that are not those of filters."""
+        return self.dimension - len(self.filters)
+
+    @property
     def noise_dimension(self) -> int:
         """Number of noise entries m."""
         raise NotImplementedError
@@ -63,16 +71,23 @@ class System:
         parts += [f"disturbance {', '.join(self.disturbance_names)}"] if self.disturbance else []
         return "<" + "; ".join(parts) + ">"
 
-    def _common(self, f: Any, states: Any, options: dict[str, Any]) -> None:
+    def _common(self, f: Any, states: Any, filters: Any, options: dict[str, Any]) -> None:
+        assign(self, filters=Filters(filters))
         imported = import_control(f, self.time) if is_control_system(f) else None
         if imported is not None:
+            if self.filters:
+                raise ValueError(
+                    "`filters` must come with a function that uses their outputs, got a python-control system; put the "
+                    "filters into that, or write `f`."
+                )
             f, states = imported.function, imported.states if states is None else states
             options = imported.options(options)
         states = symbol_names(states)
         options = {name: symbol_names(value) if name.endswith("names") else value for name, value in options.items()}
         if states is None:
             raise TypeError("`states` must be given: a number, or the states' names.")
-        assign(self, states=state_names(states))
+        own = state_names(states)
+        assign(self, states=(*own, *names("filters", self.filters.states, own)))
         assign(self, inputs=signal_box("inputs", options["inputs"], "u"))
         assign(self, disturbance=signal_box("disturbance", options["disturbance"], "d"))
         if self.disturbance is not None and not self.disturbance.bounded:
@@ -94,12 +109,15 @@ class System:
         tape = f if isinstance(f, Tape) else read_model(f, arguments)
         if tape.inputs != inputs:
             raise ValueError(f"`dynamics` must be a tape over {inputs}, got {tape.inputs}.")
-        if tape.shape not in ((self.dimension,), (self.dimension, 1)):
+        n = self.own_dimension
+        if tape.shape not in ((n,), (n, 1)):
+            beyond = f", without those of filters ({', '.join(self.states[n:])})" if self.filters else ""
             raise ValueError(
-                f"`dynamics` must return {self.dimension} values, one per state ({', '.join(self.states)}), "
+                f"`dynamics` must return {n} values, one per state ({', '.join(self.states[:n])}){beyond}, "
                 f"got shape {tape.shape}."
             )
-        return Tape(inputs=inputs, nodes=tape.nodes, outputs=tape.outputs, shape=(self.dimension,))
+        own = Tape(inputs=inputs, nodes=tape.nodes, outputs=tape.outputs, shape=(n,))
+        return self.filters.dynamics(own, self.input_names, self.time) if self.filters else own
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -121,6 +139,9 @@ class ContinuousSystem(System):
         G or g; no noise when omitted. For n = 1 a number will do.
     input_names, disturbance_names : sequence of str, optional
         Names; u1, u2, ... and d1, d2, ... when omitted (u and d alone).
+    filters : sequence of Filter, optional
+        Coloured noise and lags of inputs. Their states stand behind ``states``, and x holds them all; f and
+        ``diffusion`` have no rows for them.
 
     Raises
     ------
@@ -148,6 +169,7 @@ class ContinuousSystem(System):
         diffusion: Any = None,
         input_names: Sequence[str] | None = None,
         disturbance_names: Sequence[str] | None = None,
+        filters: Sequence[Filter] = (),
     ) -> None:
         options = {
             "inputs": inputs,
@@ -155,8 +177,11 @@ class ContinuousSystem(System):
             "input_names": input_names,
             "disturbance_names": disturbance_names,
         }
-        self._common(f, states, options)
-        assign(self, diffusion=diffusion_of(diffusion, self.states))
+        self._common(f, states, filters, options)
+        own = diffusion_of(diffusion, self.states, rows=self.own_dimension)
+        if self.filters:
+            own = self.filters.noise(None if diffusion is None else own, self.own_dimension, self.time)
+        assign(self, diffusion=own)
 
     @property
     def noise_dimension(self) -> int:
@@ -183,6 +208,9 @@ class DiscreteSystem(System):
         G; the identity when omitted. One that depends on t or x is ``gain``, and few engines serve it.
     input_names, disturbance_names : sequence of str, optional
         Names; u1, u2, ... and d1, d2, ... when omitted (u and d alone).
+    filters : sequence of Filter, optional
+        Coloured noise and lags of inputs, whose times count in steps. Their states stand behind ``states``, and x holds
+        them all; f and ``noise_matrix`` have no rows for them. Other noise must be Gaussian beside them.
 
     Raises
     ------
@@ -214,6 +242,7 @@ class DiscreteSystem(System):
         noise_matrix: Any = None,
         input_names: Sequence[str] | None = None,
         disturbance_names: Sequence[str] | None = None,
+        filters: Sequence[Filter] = (),
     ) -> None:
         options = {
             "inputs": inputs,
@@ -221,15 +250,19 @@ class DiscreteSystem(System):
             "input_names": input_names,
             "disturbance_names": disturbance_names,
         }
-        self._common(f, states, options)
+        self._common(f, states, filters, options)
         law = Gaussian(std=0.0) if noise is None else noise
         if not isinstance(law, Law):
             raise TypeError(
                 f"`noise` must be a law, got {noise!r}; a bare number does not say what it is: use one of "
                 f"{known_laws()}."
             )
-        matrix_value = np.eye(self.dimension) if noise_matrix is None else noise_matrix
-        gain = diffusion_of(matrix_value, self.states, "noise_matrix")
+        n = self.own_dimension
+        matrix_value = np.eye(n) if noise_matrix is None else noise_matrix
+        gain = diffusion_of(matrix_value, self.states, "noise_matrix", rows=n)
+        if self.filters:
+            law = self.filters.law(None if noise is None else law.resolve(gain.shape[1]))
+            gain = self.filters.noise(None if noise is None else gain, n, self.time)
         moves = isinstance(gain, Tape)
         assign(self, gain=gain if moves else None, fixed_gain=frozen(np.full(gain.shape, np.nan)) if moves else gain)
         assign(self, noise=law.resolve(gain.shape[1]))
@@ -288,6 +321,11 @@ def linear_system(
     >>> linear_system([[0, 1], [-1, -1]], diffusion=[[0], [0.5]]).time
     'continuous'
     """
+    if options.get("filters"):
+        raise ValueError(
+            "`filters` must come with a function that uses their outputs, got matrices; give cb.ContinuousSystem or "
+            "cb.DiscreteSystem `lambda x: A @ x[:n] + F @ x[n:]`."
+        )
     a = matrix("A", A)
     a = matrix("A", A, len(a), len(a))
     n = len(a)

@@ -13,7 +13,8 @@ from flint import arb
 from certbound.arrays import Array
 from certbound.display import Shown, rounded
 from certbound.errors import CertificateError
-from certbound.reach.sets import ReachTube
+from certbound.problem.problem import Problem
+from certbound.reach.sets import ReachTube, limit_names
 from certbound.rigor.balls import lower, precision, upper
 from certbound.rigor.norms import Norm
 from certbound.tubes.constants import Constants
@@ -66,6 +67,63 @@ class Deviation(Shown):
         return cls(times=times, radius=size, extent=extent)
 
 
+Limit = tuple[int, int]
+"""A limit: the number of its constraint (-1: the model's domain), and its own among those of that (`limit_names`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitBounds:
+    """Bounds of the probability that a path fails by one limit: that it is broken where the first constraint is.
+
+    Parameters
+    ----------
+    constraint : str
+        The limit: a face of a set to stay in, or a constraint as a whole.
+    log10_upper : float or None
+        log10 of a bound from above, for every start; None where nothing is proved.
+    log10_lower : float or None
+        The same from below, for some start; None where nothing is proved.
+    """
+
+    constraint: str
+    log10_upper: float | None
+    log10_lower: float | None
+
+
+def limits_of(problem: Problem) -> dict[Limit, str]:
+    """The limits by which a path can fail, each with its name; the domain is none where paths end at it."""
+    kept = problem.safe if problem.ending else problem.kept
+    return {
+        (number if number < len(problem.safe) else -1, place): name
+        for number, constraint in enumerate(kept) for place, name in enumerate(limit_names(constraint, problem.system))
+    }  # fmt: skip
+
+
+def bound_limits(
+    names: Mapping[Limit, str], upper: float, lower: float | None, *, uppers: Sequence[Mapping[Limit, float]] = (),
+    lowers: Mapping[Limit, float] | None = None,
+) -> tuple[LimitBounds, ...]:
+    """What is proved of every limit; all in log10.
+
+    ``upper`` and ``lower`` bound the probability of failing at all, and nothing but these limits fails; ``uppers`` and
+    ``lowers`` are what is proved of single limits. A path that fails meets one of the limits, so that P(this one) >=
+    P(failing) - sum of P(another one).
+    """
+    most = {limit: min([upper, 0.0, *(one[limit] for one in uppers if limit in one)]) for limit in names}
+    found = []
+    for limit, name in names.items():
+        least = -math.inf if lowers is None else lowers.get(limit, -math.inf)
+        if lower is not None:
+            others = sum(10.0**value for other, value in most.items() if other != limit)
+            rest = 10.0**lower * (1 - 1e-12) - others * (1 + 1e-12)
+            least = max(least, math.log10(rest) * (1 + 1e-14) if rest > 0 else -math.inf)
+        found.append(LimitBounds(
+            constraint=name, log10_upper=most[limit] if most[limit] < 0 else None,
+            log10_lower=least if least > -math.inf else None,
+        ))  # fmt: skip
+    return tuple(found)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EngineAnswer:
     """The best that one engine could prove.
@@ -114,6 +172,8 @@ class EngineAnswer:
         The effort that was spent (`Request`), where the engine plans its work; None: what was asked for.
     hoped : float or None
         About log10 of the lower bound that a request from ``below`` would lead to; none was looked for.
+    by_limit : mapping of Limit to float, or None
+        log10 of bounds of the probability that a path leaves first through a limit, where the engine knows them.
     """
 
     log10_delta: float = 0.0
@@ -138,6 +198,7 @@ class EngineAnswer:
     truncated: bool = False
     effort: float | None = None
     hoped: float | None = None
+    by_limit: Mapping[Limit, float] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

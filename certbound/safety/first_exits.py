@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -25,12 +25,14 @@ from certbound.problem.goals import check_end, until
 from certbound.problem.model import sources
 from certbound.problem.problem import Problem
 from certbound.problem.reductions import bring_to_rest
+from certbound.problem.sets import Box, Faces, Inside
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.intervals import Interval
-from certbound.safety.answers import EngineAnswer, Request
+from certbound.safety.answers import EngineAnswer, LimitBounds, Request, bound_limits, limits_of
 from certbound.safety.engines import values_engine
+from certbound.values.chains import bound_chain
 from certbound.values.charts import Chart
-from certbound.values.continuous import bound_mean_time, chart_slabs_of
+from certbound.values.continuous import bound_exits, bound_mean_time, chart_slabs_of
 from certbound.values.discrete import chart_failures
 from certbound.watch import OutOfTime, poll, share_of_time
 
@@ -42,6 +44,29 @@ _HALF = 0.5  # of the time that is left, at most, for the mean by one function
 _TIMES = 5  # where limits move
 _EFFORT = 0.3  # of value functions, for each of them
 _SHARE = 0.004  # cells of discrete time, as `FailureBounds` has them
+_INTERVALS = {"continuous": 16, "discrete": 64}  # over which the density is told, at most
+_SECONDS = 4.0  # of work for one limit by itself, in discrete time
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Density:
+    """Bounds of the mean density of the exit time over intervals, from every start.
+
+    Parameters
+    ----------
+    times : ndarray, shape (K + 1,)
+        Ends of the intervals, from 0 to T.
+    lower, upper : ndarray, shape (K,)
+        Of P(times[k] < exit time <= times[k + 1]) over the length of the interval: per unit of time, or step.
+    """
+
+    times: Array
+    lower: Array
+    upper: Array
+
+    def to_dict(self) -> dict[str, Any]:
+        """``times``, ``lower`` and ``upper``."""
+        return {name: getattr(self, name).tolist() for name in ("times", "lower", "upper")}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -60,6 +85,11 @@ class ExitTimes(Shown):
         The mean time of leaving is at least this, from every start and under every disturbance.
     mean_upper : float or None
         It is at most this from every start; None where nothing was proved.
+    density : Density or None
+        Bounds of the density of the exit time, from every start.
+    by_limit : tuple of LimitBounds
+        Which limit is met first, within T: bounds of the probability that it is one of those that a path breaks first.
+        Empty where that was not asked for.
     """
 
     problem: Problem
@@ -68,6 +98,8 @@ class ExitTimes(Shown):
     upper: Array
     mean_lower: float
     mean_upper: float | None
+    density: Density | None = None
+    by_limit: tuple[LimitBounds, ...] = ()
 
     def at(self, s: float) -> tuple[float, float]:
         """Bounds at any time up to the horizon, by the times beside it.
@@ -104,9 +136,11 @@ class ExitTimes(Shown):
         return found
 
     def to_dict(self) -> dict[str, Any]:
-        """``times``, ``lower``, ``upper``, ``mean_lower`` and ``mean_upper``."""
+        """``times``, ``lower``, ``upper``, ``mean_lower``, ``mean_upper``, ``density`` and ``by_limit``."""
         found: dict[str, Any] = {name: getattr(self, name).tolist() for name in ("times", "lower", "upper")}
-        return found | {"mean_lower": self.mean_lower, "mean_upper": self.mean_upper}
+        found |= {"mean_lower": self.mean_lower, "mean_upper": self.mean_upper}
+        found["density"] = None if self.density is None else self.density.to_dict()
+        return found | {"by_limit": [asdict(one) for one in self.by_limit]}
 
     def to_columns(self) -> dict[str, Array]:
         """Times and both curves, as ``pandas.DataFrame`` takes them."""
@@ -118,7 +152,9 @@ def _ends_text(low: float, high: float) -> tuple[str, str]:
 
 
 @alone()
-def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> ExitTimes:
+def bound_exit_times(
+    problem: Problem, times: Sequence[float] | None = None, *, by_limit: bool = False
+) -> ExitTimes:
     """Bound P(exit before s) for every s <= T from above and below, and the mean time of leaving.
 
     The mean comes first, and long horizons before short ones: once a limit of time is over, what was proved of them
@@ -131,6 +167,8 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
         its own for every time; otherwise they stand still, and the model does not depend on time.
     times : sequence of float, optional
         Where the curves are wanted; those of the value functions when omitted, a few where limits move.
+    by_limit : bool
+        Whether to bound also which limit is met first: a value function more for each of two limits.
 
     Returns
     -------
@@ -174,15 +212,15 @@ def bound_exit_times(problem: Problem, times: Sequence[float] | None = None) -> 
     below, least = (_below(lower, grid, k) for k in (1, 2))
     mean_lower, mean_upper = _sharper(mean, *_means(problem, grid, above, least, share))
     found = ExitTimes(
-        problem=problem, times=grid, lower=below, upper=above, mean_lower=mean_lower, mean_upper=mean_upper
-    )
+        problem=problem, times=grid, lower=below, upper=above, mean_lower=mean_lower, mean_upper=mean_upper,
+        density=_density(problem, grid, above, least),
+        by_limit=_by_limit(problem, float(above[-1]), float(below[-1])) if by_limit else (),
+    )  # fmt: skip
     if times is None:
         return found
     asked = np.unique(vector("times", times))
     ends = np.array([found.at(float(s)) for s in asked])
-    return ExitTimes(
-        problem=problem, times=asked, lower=ends[:, 0], upper=ends[:, 1], mean_lower=mean_lower, mean_upper=mean_upper
-    )
+    return replace(found, times=asked, lower=ends[:, 0], upper=ends[:, 1])
 
 
 Curve = list[tuple[float, float, float]]
@@ -335,6 +373,91 @@ def _below(curve: Curve, grid: Array, place: int) -> Array:
     for row in curve:
         found[grid >= row[0]] = np.maximum(found[grid >= row[0]], row[place])
     return found
+
+
+def _density(problem: Problem, grid: Array, above: Array, least: Array) -> Density:
+    """Differences of the curves: P(a < exit <= b) <= P(exit by b) - P(exit by a), each from its side.
+
+    ``least`` bounds the probability from every start, under the worst disturbance: another one may leave later, so that
+    with a disturbance nothing is taken off, and nothing is known from below.
+    """
+    horizon = float(problem.horizon)
+    times = np.linspace(0.0, horizon, _INTERVALS[problem.system.time] + 1)
+    if problem.system.time == "discrete":
+        times = np.unique(np.round(times))
+    most = above[np.searchsorted(grid, times)]
+    kept = least[np.searchsorted(grid, times, side="right") - 1] * (problem.system.disturbance is None)
+    length = np.diff(times)
+    lower = np.maximum((kept[1:] - most[:-1]) / length, 0.0) * (1 - 1e-12)
+    return Density(times=times, lower=lower, upper=(most[1:] - kept[:-1]) / length * (1 + 1e-12))
+
+
+def _by_limit(problem: Problem, upper: float, lower: float) -> tuple[LimitBounds, ...]:
+    """Bounds of which limit is met first: between two limits, each with the other one as an end that does not fail.
+
+    From one start, without a disturbance, P(this one) = P(leaving) - P(the other one).
+    """
+    names, sides = limits_of(problem), _sides(problem)
+    uppers: dict[tuple[int, int], float] = {}
+    lowers: dict[tuple[int, int], float] = {}
+    ends = [] if sides is None else [_first_at(problem, sides[k][0], sides[1 - k][0], up=bool(k)) for k in (0, 1)]
+    plain = problem.fixed_start and problem.system.disturbance is None
+    for k, (least, most) in enumerate(ends):
+        limits = sides[k][1] if sides else []
+        most = min(most, upper * (1 + 1e-12) - ends[1 - k][0] * (1 - 1e-12)) if plain else most
+        uppers |= {limit: _log10(most, up=True) for limit in limits}
+        lowers |= {limits[0]: _log10(least, up=False)} if len(limits) == 1 else {}
+    rest = _log10(lower, up=False)
+    return bound_limits(
+        names, _log10(upper, up=True), None if rest == -math.inf else rest, uppers=[uppers], lowers=lowers
+    )
+
+
+def _log10(value: float, *, up: bool) -> float:
+    """log10 of a probability, rounded up or down: -inf only downward."""
+    if value <= 0:
+        return -300.0 if up else -math.inf
+    return min(math.log10(value) * (1 - 1e-14) + 1e-14, 0.0) if up else math.log10(value) * (1 + 1e-14) - 1e-14
+
+
+Side = tuple[float, list[tuple[int, int]]]
+"""Where a limit lies, and the limits on this side: those that are met together count as met first."""
+
+
+def _sides(problem: Problem) -> tuple[Side, Side] | None:
+    """The lower and the upper limit of the state; None where there are not just two, or where floats round them."""
+    low: list[tuple[float, tuple[int, int]]] = []
+    high: list[tuple[float, tuple[int, int]]] = []
+    for number, constraint in enumerate(problem.kept):
+        region, form = constraint.region, constraint.region.form
+        plain = isinstance(region, Box) and region.center is None and not constraint.outside
+        if not plain or not isinstance(form, Faces):
+            return None
+        own = number if number < len(problem.safe) else -1
+        for place, (row, bound) in enumerate(zip(form.normals[:, 0], form.bounds)):
+            (high if row > 0 else low).append((float(bound if row > 0 else -bound), (own, place)))
+    if not low or not high:
+        return None
+    least, most = max(end for end, _ in low), min(end for end, _ in high)
+    return (least, [limit for _, limit in low]), (most, [limit for _, limit in high])
+
+
+def _first_at(problem: Problem, place: float, other: float, *, up: bool) -> tuple[float, float]:
+    """Bounds of P(the state leaves at ``place`` within T, before it leaves at the ``other`` end); 0 and 1 for none."""
+    inside, ends = ((-math.inf, place), (other, math.inf)) if up else ((place, math.inf), (-math.inf, other))
+    alone = problem.replace(
+        safe=[Inside(Box(*([end] for end in inside)))], domain=Box(*([end] for end in ends)), leaving="ends"
+    )
+    try:
+        with contained("values"), share_of_time(_HALF if not up else 1.0):
+            if isinstance(problem.system, ContinuousSystem):
+                found = bound_exits(alone)
+                least = 0.0 if found.lower is None else _power(found.lower, up=False)
+                return least, max(_power(found.upper, up=True), 1e-300)
+            chain = bound_chain(alone, seconds=_SECONDS)
+            return chain.lower, chain.upper
+    except (EngineError, InfeasibleError, OutOfTime):
+        return 0.0, 1.0
 
 
 def _mean_by_function(problem: Problem) -> tuple[float, float | None] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,7 +13,17 @@ from certbound.display import Shown, at_least_text, log10_text, name_text, round
 from certbound.errors import CertificateError, SolverError
 from certbound.problem.problem import Problem
 from certbound.reach.sets import ReachTube
-from certbound.safety.answers import SPARED, Deviation, EngineAnswer, is_at_most, is_more_than, settled
+from certbound.safety.answers import (
+    SPARED,
+    Deviation,
+    EngineAnswer,
+    LimitBounds,
+    bound_limits,
+    is_at_most,
+    is_more_than,
+    limits_of,
+    settled,
+)
 from certbound.safety.falsification import Violation
 from certbound.watch import Watch
 
@@ -95,6 +105,22 @@ class Verdict(Shown):
     reserves: dict[str, EngineAnswer] = field(default_factory=dict, repr=False)
     cells: tuple[Any, ...] = field(default=(), repr=False)
     stated: Problem | None = field(default=None, repr=False)
+
+    @property
+    def by_limit(self) -> tuple[LimitBounds, ...]:
+        """Which limit is met first: bounds of the probability that it is one of those that a path breaks first.
+
+        A limit is a face of a set to stay in, or an obstacle or a round set as a whole. From above the bounds hold for
+        every start, from below for some. What is known of single limits is what the engine knows that proved them
+        one by one (the linear response, from one cell of starts); elsewhere the bound of failing at all stands.
+        """
+        problem = self.problem
+        if problem is None:
+            return ()
+        plain = problem.reach is None and not (self.members or problem.random)
+        known = [one.by_limit for one in self.answers.values() if one.applicable and one.certified and one.by_limit]
+        lower = self.log10_lower if problem.reach is None else None  # never to arrive is another way to fail
+        return bound_limits(limits_of(problem), self.log10_delta, lower, uppers=known if plain else ())
 
     @property
     def worst(self) -> Verdict:
@@ -189,6 +215,7 @@ class Verdict(Shown):
         found: dict[str, Any] = {name: getattr(self, name) for name in names}
         found["delta"] = None if self.problem is None else self.problem.delta
         found["constants"] = None if self.constants is None else self.constants.to_dict()
+        found["by_limit"] = [asdict(one) for one in self.by_limit]
         return found | {"tube": None if self.deviation is None else self.deviation.to_dict()}
 
     def to_columns(self) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from certbound.tubes.kummer import mixing
 
 VERIFY_KEYS = {
     "status", "log10_delta", "log10_lower", "delta", "margin", "time", "constraint", "reason", "method", "constants",
-    "tube", "seconds",
+    "tube", "by_limit", "seconds",
 }  # fmt: skip
 
 

@@ -308,7 +308,8 @@ def test_the_command_prints_the_curves(tmp_path, capsys):
     save(problem, tmp_path / "walk.toml")
     assert run(["exit-times", str(tmp_path / "walk.toml"), "--json", "--plot", str(tmp_path / "walk.png")]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert list(result) == ["times", "lower", "upper", "mean_lower", "mean_upper", "seconds"]
+    keys = ["times", "lower", "upper", "mean_lower", "mean_upper", "density", "by_limit", "seconds"]
+    assert list(result) == keys
     assert result["upper"][-1] > result["lower"][-1] > 0.5
     assert (tmp_path / "walk.png").stat().st_size > 5000
     assert run(["exit-times", str(tmp_path / "walk.toml")]) == 0
@@ -347,7 +348,7 @@ def test_a_mean_that_was_proved_in_time_stands_without_curves(monkeypatch):
 def test_the_command_has_a_limit_of_its_own(found, monkeypatch, capsys):
     limits = []
 
-    def asked(problem):
+    def asked(problem, by_limit):
         limits.append(current_watch().limit)
         return found
 
@@ -358,7 +359,7 @@ def test_the_command_has_a_limit_of_its_own(found, monkeypatch, capsys):
 
 
 def test_a_command_whose_time_is_over_before_anything_is_proved_says_so(monkeypatch, capsys):
-    def late(problem):
+    def late(problem, by_limit):
         raise OutOfTime
 
     monkeypatch.setattr(first_exits, "bound_exit_times", late)

@@ -51,7 +51,7 @@ def exit_times(
         from certbound.safety.first_exits import bound_exit_times
 
         with Clock(limit, tell).running():
-            found = bound_exit_times(subject)
+            found = bound_exit_times(subject, by_limit=as_json)
     result: dict[str, Any] = {**found.to_dict(), "seconds": time.perf_counter() - started}
     if plot is not None:
         from matplotlib.figure import Figure

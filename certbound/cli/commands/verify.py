@@ -164,6 +164,7 @@ def _result(problem: Problem, verdict: Verdict, seconds: float) -> dict[str, Any
         **attributes(verdict, "margin", "time", "constraint", "reason", "method"),
         "constants": None if verdict.constants is None else describe_constants(verdict.constants),
         "tube": describe_deviation(verdict),
+        "by_limit": [asdict(one) for one in verdict.by_limit],
         "seconds": seconds,
     }
 

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.checks import located, nearest
 from certbound.checks import names as checked_names
-from certbound.checks import nearest
 from certbound.problem.files.constants_drawn import read_random
 from certbound.problem.files.parser import RESERVED, constant, parse
 from certbound.problem.files.schema import Specification
+from certbound.problem.filters import Filter, Filters
 from certbound.problem.model import Graph, Network, Tape
 from certbound.problem.networks import network
 
@@ -27,7 +28,7 @@ class Reader:
 
     def __init__(self, spec: Specification, folder: Path | None) -> None:
         self.spec, self.folder = spec, folder
-        self.states = checked_names("states", spec.states, RESERVED)
+        self.own = self.states = checked_names("states", spec.states, RESERVED)
         self.inputs = checked_names("inputs", list(spec.inputs), {*RESERVED, *self.states})
         taken = {*RESERVED, *self.states, *self.inputs}
         self.disturbances = checked_names("disturbances", [*spec.disturbances, *spec.uncertain, *spec.random], taken)
@@ -35,11 +36,27 @@ class Reader:
         self.parameters = dict.fromkeys(checked_names("parameters", list(spec.parameters), taken), 0.0)
         self.parameters |= {name: self.number(value, name) for name, value in spec.parameters.items()}
         taken |= set(self.parameters)
+        self.filters = self._filters()
+        self.states = (*self.own, *checked_names("noise.filter", self.filters.states, sorted(taken)))
+        taken |= set(self.states)
         checked_names("networks", list(spec.networks), taken)
         paths = {name: self.file(value, f"networks.{name}") for name, value in spec.networks.items()}
         self.networks = {name: _network(path, name) for name, path in paths.items()}
         checked_names("definitions", list(spec.definitions), taken | set(self.networks))
         self.random = {name: read_random(table, self.array, f"random.{name}") for name, table in spec.random.items()}
+
+    def _filters(self) -> Filters:
+        found = []
+        for place, table in enumerate(self.spec.noise.filter if self.spec.noise is not None else []):
+            where = f"noise.filter.{place}"
+            given = {name: value for name, value in table if value is not None}
+            texts = ("state", "kind", "axis", "input")
+            values: dict[str, Any] = {
+                name: value if name in texts else self.number(value, f"{where}.{name}") for name, value in given.items()
+            }
+            with located(where, type(table).model_fields):
+                found.append(Filter(**values))
+        return Filters(found)
 
     def number(self, value: float | str, where: str, *, quoted: bool = False) -> float:
         """A number, or the value of an expression in the parameters; in quotes a mere number only if ``quoted``."""
@@ -67,6 +84,13 @@ class Reader:
         if isinstance(rows, list) and len({len(row) if isinstance(row, list) else 0 for row in rows}) > 1:
             raise ValueError(f"`{where}` must have rows of equal length.")
         return np.array(rows, dtype=float)
+
+    def widened(self, values: Array, axes: int) -> Array:
+        """Entries by state, along the last axes, that leave out the states of filters: 0 for these."""
+        more = len(self.states) - len(self.own)
+        if not more or np.shape(values)[-1] != len(self.own):
+            return values
+        return np.pad(values, [(0, 0)] * (np.ndim(values) - axes) + [(0, more)] * axes)
 
     def function(
         self, texts: Sequence[float | str], inputs: Sequence[str], where: Sequence[str], shape: tuple[int, ...]
@@ -109,8 +133,11 @@ class Reader:
     def by_state(self, table: Any, where: str) -> tuple[list[Any], tuple[int, ...] | None]:
         """Entries given by state name or as a list, and the states' indices (None: all, in order)."""
         if isinstance(table, list):
+            if len(table) == len(self.own) < len(self.states):
+                return table, tuple(range(len(self.own)))
             if len(table) != len(self.states):
-                raise ValueError(f"`{where}` must have {len(self.states)} entries, got {len(table)}.")
+                either = f" or {len(self.own)}" if self.filters else ""
+                raise ValueError(f"`{where}` must have {len(self.states)}{either} entries, got {len(table)}.")
             return table, None
         for key in table:
             if key not in self.states:

@@ -59,7 +59,8 @@ class _ProblemReader(SetReader):
     def system(self) -> ContinuousSystem | DiscreteSystem:
         spec = self.spec
         options: dict[str, Any] = {
-            "states": self.states,
+            "states": self.own,
+            "filters": self.filters.members,
             "inputs": self.signal(spec.inputs, "inputs"),
             "disturbance": self.signal(self.bounds(), "disturbances"),
             "input_names": self.inputs or None,
@@ -70,21 +71,25 @@ class _ProblemReader(SetReader):
         if "A" in keys and "A" not in self.states:
             for key in keys - {"A", "B", "b", "E"}:
                 raise ValueError(f"unknown key {key!r} in [dynamics]{nearest(key, ['A', 'B', 'b', 'E'])}")
+            if self.filters:
+                raise ValueError("`dynamics.A` must be omitted beside [[noise.filter]]; write each state's expression.")
             options |= {key: self.matrix(value, f"dynamics.{key}") for key, value in spec.dynamics.items()}
             return linear_system(time=spec.time, **options)
-        for key in keys - set(self.states):
-            raise ValueError(f"unknown key {key!r} in [dynamics]{nearest(key, self.states)}")
-        for name in self.states:
+        for key in keys - set(self.own):
+            if key in self.states:
+                raise ValueError(f"`dynamics.{key}` must be omitted, [[noise.filter]] gives it.")
+            raise ValueError(f"unknown key {key!r} in [dynamics]{nearest(key, self.own)}")
+        for name in self.own:
             if name not in spec.dynamics:
                 raise ValueError(f"`dynamics` must give every state, {name} is missing; write {name} = \"...\".")
             given = spec.dynamics[name]
             if isinstance(given, bool) or not isinstance(given, (str, int, float)):
                 got = str(given).lower() if isinstance(given, bool) else repr(given)
                 raise ValueError(f"`dynamics.{name}` must be an expression in quotes, got {got}.")
-        where = [f"dynamics.{name}" for name in self.states]
+        where = [f"dynamics.{name}" for name in self.own]
         inputs = ("t", *self.states, *self.inputs, *self.disturbances)
-        texts = [spec.dynamics[name] for name in self.states]
-        tape = self.function(texts, inputs, where, (len(self.states),))
+        texts = [spec.dynamics[name] for name in self.own]
+        tape = self.function(texts, inputs, where, (len(self.own),))
         return (ContinuousSystem if spec.time == "continuous" else DiscreteSystem)(tape, **options)
 
     def bounds(self) -> dict[str, list[Any]]:
@@ -105,28 +110,29 @@ class _ProblemReader(SetReader):
 
     def diffusion(self) -> dict[str, Any]:
         table = self.spec.noise
-        if table is None:
+        if table is None or (self.filters and not table.white):
             return {}
-        extra = sorted(table.model_fields_set - {"diffusion"})
+        extra = sorted({*table.model_fields_set, *(table.model_extra or {})} - {"diffusion", "filter"})
         if extra or table.diffusion is None:
             raise ValueError(
                 "`noise` must hold `diffusion` alone in continuous time, a matrix with "
-                f"{len(self.states)} rows, got {', '.join(extra) or 'nothing'}; write `diffusion = [[...]]`, a row for "
-                "every state and a column for every Brownian motion: laws and `matrix` are of discrete time."
+                f"{len(self.own)} rows, and [[noise.filter]], got {', '.join(extra) or 'nothing'}; write "
+                "`diffusion = [[...]]`, a row for every state and a column for every Brownian motion: laws and "
+                "`matrix` are of discrete time."
             )
         value = table.diffusion
         if isinstance(value, dict):
-            for key in value.keys() - set(self.states):
-                raise ValueError(f"unknown key {key!r} in `noise.diffusion`{nearest(key, self.states)}")
-            noisy = [name for name in self.states if name in value]
-            value = [[value[name] if name == column else 0.0 for column in noisy] for name in self.states]
-        elif not isinstance(value, list) and len(self.states) == 1:
+            for key in value.keys() - set(self.own):
+                raise ValueError(f"unknown key {key!r} in `noise.diffusion`{nearest(key, self.own)}")
+            noisy = [name for name in self.own if name in value]
+            value = [[value[name] if name == column else 0.0 for column in noisy] for name in self.own]
+        elif not isinstance(value, list) and len(self.own) == 1:
             value = [[value]]
         if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
             got = f"a list of {len(value)}" if isinstance(value, list) else repr(value)
-            table_of = ", ".join(f"{name} = ..." for name in self.states[:2])
+            table_of = ", ".join(f"{name} = ..." for name in self.own[:2])
             raise ValueError(
-                f"`noise.diffusion` must be a matrix with {len(self.states)} rows (one per state), got {got}; write "
+                f"`noise.diffusion` must be a matrix with {len(self.own)} rows (one per state), got {got}; write "
                 f"diffusion = {{ {table_of} }} for noises of single states that are independent, or a column "
                 "[[...], [...]] for one common noise."
             )
@@ -153,7 +159,7 @@ class _ProblemReader(SetReader):
 
     def law(self) -> dict[str, Any]:
         table = self.spec.noise
-        if table is None:
+        if table is None or (self.filters and not table.white):
             return {}
         if table.diffusion is not None or table.law not in LAWS:
             cure = nearest(f"{table.law}", LAWS) if table.law else '; write for example law = "gaussian" and std = 0.1.'
@@ -210,4 +216,5 @@ class _ProblemReader(SetReader):
         return self.number(table["hold"], "plan.hold") if held else None
 
     def weights(self, cost: Cost) -> tuple[Array, Array]:
-        return self.matrix(cost.Q, "cost.Q"), self.matrix(cost.R, "cost.R")
+        state = self.matrix(cost.Q, "cost.Q")
+        return self.widened(state, state.ndim), self.matrix(cost.R, "cost.R")

@@ -207,8 +207,25 @@ class Cost(_Table):
     R: Vector | Matrix
 
 
+class FilterTable(_Table):
+    """Coloured noise, or the lag of an input, as states behind those of the file."""
+
+    title: ClassVar[str] = "[[noise.filter]]"
+    state: str
+    kind: str
+    std: Number | None = None
+    time: Number | None = None
+    length: Number | None = None
+    speed: Number | None = None
+    axis: str | None = None
+    density: Number | None = None
+    low: Number | None = None
+    high: Number | None = None
+    input: str | None = None
+
+
 class Noise(_Table):
-    """CT: diffusion, a matrix or a table by state. DT: a law, its one level, its flags, and a matrix."""
+    """CT: diffusion, a matrix or a table by state. DT: a law, its one level, its flags, and a matrix. Both: filters."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Matrix | Number | Vector | bool]
@@ -217,6 +234,12 @@ class Noise(_Table):
     diffusion: Matrix | Number | Vector | dict[str, Number] | None = None
     law: str | None = None
     matrix: Matrix | Number | Vector | None = None
+    filter: list[FilterTable] = []
+
+    @property
+    def white(self) -> bool:
+        """Whether there is more than filters."""
+        return bool(self.model_fields_set - {"filter"} or self.model_extra)
 
 
 class RandomTable(_Table):

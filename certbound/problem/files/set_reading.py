@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -42,9 +42,8 @@ class SetReader(Reader):
             if any(isinstance(end, Tape) for pair in read for end in pair):
                 return self.moving_box(read, indices, center)
         ends = [self.array(pair, name) for name, pair in zip(names, pairs)]
-        if missing is None and len(ends) != len(self.states):
-            absent = [name for k, name in enumerate(self.states) if k not in indices]
-            raise ValueError(f"`{where}` must bound every state, {', '.join(absent)} is missing.")
+        if missing is None and coordinates is not None:
+            self._complete(coordinates, where)
         low, high = np.full(len(self.states), -np.inf), np.full(len(self.states), np.inf)
         for index, pair in zip(indices, ends):
             if pair[0] > pair[1]:
@@ -52,6 +51,8 @@ class SetReader(Reader):
                 got = f"{pair[0]:g} > {pair[1]:g}"
                 raise ValueError(f"`{where}.{state}` must be [low, high], got {got}; swap the two.")
             low[index], high[index] = pair
+        if missing is None:
+            low, high = low[: len(ends)], high[: len(ends)]  # without the states of filters, which stand behind
         return sets.Box(low, high, center=center)
 
     def moving_box(self, pairs: list[list[Any]], indices: Any, center: Any) -> sets.Box:
@@ -73,8 +74,7 @@ class SetReader(Reader):
         where = f"{where}.{table.chosen}"
         match table.chosen:
             case "point":
-                values, coordinates = self.by_state(table.point, where)
-                return self.array(self._ordered(values, coordinates, where), where)
+                return self.point(*self.by_state(table.point, where), where)
             case "box":
                 return self.box(table.box, where, None)
             case "gaussian":
@@ -97,14 +97,24 @@ class SetReader(Reader):
             return replace(region, center=region.center[order], coordinates=None, **shape)
         return region
 
-    def _ordered(self, values: list[Any], coordinates: tuple[int, ...] | None, where: str) -> list[Any]:
+    def point(self, values: list[Any], coordinates: tuple[int, ...] | None, where: str) -> Any:
+        """A point of all states, or of all but those of filters; some of these filters may have theirs."""
         if coordinates is None:
-            return values
-        self._complete(coordinates, where)
-        return [values[coordinates.index(k)] for k in range(len(values))]
+            return self.array(values, where)
+        given = dict(zip((self.states[k] for k in coordinates), self.array(values, where)))
+        fixed = [one for one in self.filters.members if given.keys() & set(one.states)]
+        self._complete(coordinates, where, [name for one in fixed for name in one.states])
+        own = [given.pop(name) for name in self.own]
+        if len(fixed) == len(self.filters.members):
+            return own + [given[name] for name in self.states[len(own) :]]
+        ends = {name: self.array(pair, f"inputs.{name}") for name, pair in self.spec.inputs.items()}
+        return self.filters.start(sets.Box(own, own), ends, given)
 
-    def _complete(self, coordinates: tuple[int, ...], where: str) -> None:
-        absent = [name for k, name in enumerate(self.states) if k not in coordinates]
+    def _complete(self, coordinates: tuple[int, ...], where: str, filtered: Sequence[str] | None = None) -> None:
+        """Refuse to do without a state; those of filters may all be left out, or all but the ``filtered`` ones."""
+        only_own = all(k < len(self.own) for k in coordinates)
+        wanted = self.own if only_own else self.states if filtered is None else (*self.own, *filtered)
+        absent = [name for name in wanted if self.states.index(name) not in coordinates]
         if absent:
             raise ValueError(f"`{where}` must give every state, {', '.join(absent)} is missing.")
 
@@ -122,9 +132,12 @@ class SetReader(Reader):
                 fields["normal"][chosen] = self.array(values, place)
             elif isinstance(value, list):
                 if any(isinstance(row, list) for row in value):
-                    fields[name] = self.matrix(value, place)
+                    read: Any = self.matrix(value, place)
+                elif name == "A":
+                    read = self.array(value, place)
                 else:
-                    fields[name] = [self.side(entry, f"{place}.{k}") for k, entry in enumerate(value)]
+                    read = [self.side(entry, f"{place}.{k}") for k, entry in enumerate(value)]
+                fields[name] = self.widened(read, 1) if name == "A" else read
             else:
                 fields[name] = self.side(value, place)
         with located(where, fields):
@@ -157,7 +170,7 @@ class SetReader(Reader):
 
     def polygon(self, table: PolygonTable, where: str, *, outward: bool) -> sets.Polytope:
         vertices: Any = table.vertices
-        names = list(vertices) if isinstance(vertices, dict) else self.states
+        names = list(vertices) if isinstance(vertices, dict) else self.own
         if len(names) != 2 or not set(names) <= set(self.states):
             raise ValueError(f"`{where}.vertices` must give two of the states {', '.join(self.states)} by name.")
         rows = list(vertices.values()) if isinstance(vertices, dict) else vertices

@@ -223,6 +223,13 @@ class Region:
         """The indices of the states that the set lives in, of ``dimension`` states."""
         return list(range(dimension) if self.coordinates is None else self.coordinates)
 
+    def touched(self, dimension: int) -> set[int]:
+        """The indices of the states, of ``dimension``, that decide whether a state lies in the set."""
+        places = np.array(self.places(dimension))
+        form = self.form
+        bounded = np.any(form.normals != 0, axis=0) if isinstance(form, Faces) else np.ones(len(places), dtype=bool)
+        return {int(place) for place in places[bounded]}
+
     def lifted(self, rows: Array, dimension: int) -> Array:
         """Rows over the set's coordinates as rows over the whole state, shape (..., dimension)."""
         full = np.zeros((*rows.shape[:-1], dimension))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from certbound.arrays import Array
 from certbound.display import log10_text
 from certbound.errors import EngineError
+from certbound.gaussian.response import logsumexp
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.linear import answer_tubes
 from certbound.reach.linear.answer_tubes import DeviationTube
@@ -59,6 +60,30 @@ class LinearAnswer:
         return not self.run.curved and (
             isinstance(system, ContinuousSystem) or bool(system.noise.gaussian)
         )
+
+    @property
+    def by_limit(self) -> dict[tuple[int, int], float] | None:
+        """log10 of bounds of P(a path leaves first through a limit), by the numbers of constraint and limit.
+
+        A path that leaves through a limit meets what the events share, or one of the limit's own: the sum of these.
+        None where they are not known one by one: with several cells of the start, or where nothing was proved.
+        """
+        outcome, asked = self.outcome, self.run.requirements[self.outcome.cell]
+        if self.run.engine.cells > 1 or outcome.bounds is None or len(outcome.logs) != len(asked):
+            return None
+        places: dict[tuple[int, int], list[int]] = {}
+        for place, requirement in enumerate(asked):
+            places.setdefault((requirement.constraint, requirement.limit), []).append(place)
+        return {limit: self._cost_of(own) for limit, own in places.items()}
+
+    def _cost_of(self, places: list[int]) -> float:
+        """log10 of what some requirements cost together."""
+        outcome = self.outcome
+        log = logsumexp(np.array([outcome.shared, *(outcome.logs[place] for place in places)]))
+        if outcome.unshared:
+            log = min(log, logsumexp(np.array([outcome.unshared[place] for place in places])))
+        value = log / np.log(10.0)
+        return max(float(value + 1e-14 * (1 + abs(value))), answer_tubes.LEAST)
 
     @cached_property
     def _tightest(self) -> tuple[Requirement | None, int, float]:
@@ -196,6 +221,11 @@ class SplitAnswer(LinearAnswer):
     paths: tuple[Path, ...]
     low: Array
     high: Array
+
+    @property
+    def by_limit(self) -> None:
+        """The worst cell for one limit need not be that for another."""
+        return None
 
     @classmethod
     def of(cls, cells: list[tuple[Path, Array, Array, LinearAnswer]]) -> SplitAnswer:

@@ -51,6 +51,8 @@ class Outcome:
     bounds: tuple[Array, Array] | None  # (B, N, n): the proved enclosure of the remainder beta, None when it fed itself
     cell: int = 0  # the worst cell
     logs: tuple[float, ...] = ()  # what every requirement costs there
+    shared: float = 0.0  # and what they cost in common
+    unshared: tuple[float, ...] = ()  # or what each costs where they share nothing
 
 
 class LinearRun(Inclusion):
@@ -218,8 +220,10 @@ class LinearRun(Inclusion):
             logs = [self._entered(cell, r, log, bounds) for r, log in zip(asked, logs, strict=True)]
         total = logsumexp(np.array([shared, *logs]))
         steady = [event for event in along if isinstance(event, SteadyEvent)]
+        unshared: list[float] = []
         if asked and not self.curved and len(steady) == len(along):
-            total = min(total, logsumexp(np.array([e.log_unshared(rooms[:, i]) for i, e in enumerate(steady)])))
+            unshared = [e.log_unshared(rooms[:, i]) for i, e in enumerate(steady)]
+            total = min(total, logsumexp(np.array(unshared)))
         if total > _LIKELY and isinstance(events, StepEvents) and events.gaussian:
             total = min(total, correlated(events, asked, rooms, shared, logs))
         if total > _OVERLAPPING and isinstance(events, StepEvents) and events.gaussian and asked:
@@ -227,6 +231,7 @@ class LinearRun(Inclusion):
             total = min(total, logsumexp(np.array([shared, joined])))
         return Outcome(
             log_probability=min(total, 0.0), nonlinear=nonlinear, bounds=bounds, cell=cell, logs=tuple(logs),
+            shared=shared, unshared=tuple(unshared),
         )
 
     def _entered(self, cell: int, asked: Requirement, log: float, bounds: tuple[Array, Array]) -> float:

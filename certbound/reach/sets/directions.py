@@ -63,10 +63,14 @@ class NominalPieces:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Requirement:
-    """rows[k] . S_t <= room[k] on piece k keeps constraint number ``constraint`` (room is inf where not asked)."""
+    """rows[k] . S_t <= room[k] on piece k keeps constraint number ``constraint`` (room is inf where not asked).
+
+    ``limit`` is that of its limits (`limit_names`) to which it belongs.
+    """
 
     label: str
     constraint: int
+    limit: int
     rows: Array
     room: Array
 
@@ -76,9 +80,31 @@ def requirements(problem: Problem, curve: NominalPieces) -> list[Requirement]:
     found = []
     for number, constraint in enumerate(problem.constraints):
         own, needed = number if number < len(problem.safe) else -1, curve.required(constraint.during)
-        for label, rows, room in _constraint(constraint, curve, problem.system):
-            found.append(Requirement(label=label, constraint=own, rows=rows, room=np.where(needed, room, np.inf)))
+        by_faces = isinstance(constraint.region.form, Faces) and not constraint.outside
+        for place, (label, rows, room) in enumerate(_constraint(constraint, curve, problem.system)):
+            asked = np.where(needed, room, np.inf)
+            limit = place if by_faces else 0
+            found.append(Requirement(label=label, constraint=own, limit=limit, rows=rows, room=asked))
     return found
+
+
+def limit_names(constraint: Inside, system: System) -> list[str]:
+    """Names of the limits that a constraint is made of: the faces of a set to stay in, or the constraint itself."""
+    form = constraint.region.form
+    if not isinstance(form, Faces) or constraint.outside:
+        return [str(constraint.label)]
+    normals = constraint.region.lifted(form.normals, system.dimension)
+    return [_face(constraint, row, index, len(normals), system) for index, row in enumerate(normals)]
+
+
+def _face(constraint: Inside, row: Array, index: int, count: int, system: System) -> str:
+    region, label = constraint.region, str(constraint.label)
+    if count == 1:
+        return label
+    side = _side(region, row, index, system)
+    named = region.kind != "box" or label != region.describe(system.states, constraint.word)
+    named &= " <= " not in label  # a box that is stated in other coordinates is not named either
+    return side if side and not named else f"{label}, side {index + 1}{side and f' ({side})'}"
 
 
 Rows = Iterator[tuple[str, Array, Array]]
@@ -97,12 +123,7 @@ def _constraint(constraint: Inside, curve: NominalPieces, system: System) -> Row
             a, b = _facets(region, form, curve)
             for index in range(len(a)):
                 rows = np.broadcast_to(a[index], (curve.pieces, a.shape[1])).copy()
-                side, text = _side(region, a[index], index, system), label
-                if len(a) > 1:
-                    named = region.kind != "box" or label != region.describe(system.states, constraint.word)
-                    named &= " <= " not in label  # a box that is stated in other coordinates is not named either
-                    text = side if side and not named else f"{label}, side {index + 1}{side and f' ({side})'}"
-                yield text, rows, curve.least(rows, b[:, index])
+                yield _face(constraint, a[index], index, len(a), system), rows, curve.least(rows, b[:, index])
 
 
 def _side(region: Region, row: Array, index: int, system: System) -> str:

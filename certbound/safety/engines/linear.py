@@ -59,6 +59,7 @@ def linear_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
         details=answer,
         conclusive=answer.exact and answer.margin > -np.inf,
         foresight=foresight,
+        by_limit=answer.by_limit,
     )
 
 
@@ -81,6 +82,7 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
         log10_delta=answer.log10_delta, margin=answer.margin if np.isfinite(answer.margin) else None,
         time=answer.time, constraint=answer.constraint, reason=answer.reason, tube=tube, reach=answer.noise_free_reach,
         deviation=None if tube is None else _deviation(answer, tube), method="linear", details=answer, foresight=True,
+        by_limit=answer.by_limit,
     )
 
 
