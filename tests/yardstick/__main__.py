@@ -33,6 +33,8 @@ def main() -> int:
             _write(options.out, runs)
     sys.stdout.write(f"{time.perf_counter() - begin:.0f} s\n")
     if stored:
+        missing = [one.name for one in _chosen(options.names) if one.name not in stored]
+        sys.stdout.write(f"nothing stored of: {', '.join(missing)}\n" if missing else "")
         sys.stdout.write(f"weaker or lost: {', '.join(losses) or 'nothing'}\n")
     return int(bool(losses))
 
@@ -65,7 +67,8 @@ def _stored(file: Path) -> dict[str, Run]:
 
 
 def _write(file: Path, runs: dict[str, Run]) -> None:
-    rows = [f"{json.dumps(name)}: {json.dumps(run.as_data())}" for name, run in runs.items()]
+    known = [name for name in entries() if name in runs]
+    rows = [f"{json.dumps(name)}: {json.dumps(runs[name].as_data())}" for name in known]
     file.write_text("{\n" + ",\n".join(rows) + "\n}\n", encoding="utf-8")
 
 

@@ -18,7 +18,8 @@ LOSSES = ("weaker", "lost")
 
 def differences(new: Run, old: Run) -> list[str]:
     """What differs between two runs of a problem, in words; those that begin with one of `LOSSES` are losses."""
-    found = [*_of_bounds("above", new.upper, old.upper, 1.0), *_of_bounds("below", new.lower, old.lower, -1.0)]
+    found = [f"asked for {new.limit:g} s, not {old.limit:g}"] if new.limit != old.limit else []
+    found += [*_of_bounds("above", new.upper, old.upper, 1.0), *_of_bounds("below", new.lower, old.lower, -1.0)]
     if new.status != old.status:
         word = "lost status" if old.status in DECIDED else "status"
         found.append(f"{word}: {old.status} -> {new.status}")

@@ -1,6 +1,7 @@
 """What certbound proves of one problem: ``python -m tests.yardstick.measure NAME LIMIT METHOD`` prints it as JSON.
 
-All seconds, those of limits too, are of processor time: what else the machine does changes nothing.
+All seconds, those of limits too, are of processor time, so that waiting for a busy machine does not count. Work that
+shares its caches with other work takes up to three times as many of them: compare runs of a quiet machine.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ class Run:
     engine : str
     certificate : int
         Bytes of the certificate that the checker proved; 0 for none.
+    limit : float
+        Seconds that each question was allowed to take.
     """
 
     status: str
@@ -49,6 +52,7 @@ class Run:
     seconds: float
     engine: str
     certificate: int
+    limit: float
 
     def as_data(self) -> dict[str, Any]:
         """Plain data for a file."""
@@ -71,7 +75,7 @@ def measure(name: str, limit: float, method: str) -> Run:
         upper, lower = min(upper, second.log10_delta), max(lower, _lower(second))
     return Run(
         status=first.status, upper=None if upper == 0 else upper, lower=None if lower == -math.inf else lower,
-        seconds=seconds, engine=first.method or "", certificate=certificate,
+        seconds=round(seconds, 2), engine=first.method or "", certificate=certificate, limit=limit,
     )  # fmt: skip
 
 
@@ -92,15 +96,15 @@ def measured(name: str, limit: float, method: str) -> Run:
             timeout=_BUSY * (_QUESTIONS * limit + _GRACE),
         )
     except subprocess.TimeoutExpired:
-        return _failed("HANGS")
+        return _failed("HANGS", limit)
     if done.returncode:
         last = done.stderr.strip().splitlines()[-1:]
-        return _failed(f"FAILS: {' '.join(last)[:200]}")
+        return _failed(f"FAILS: {' '.join(last)[:200]}", limit)
     return Run(**json.loads(done.stdout.splitlines()[-1]))
 
 
-def _failed(status: str) -> Run:
-    return Run(status=status, upper=None, lower=None, seconds=0.0, engine="", certificate=0)
+def _failed(status: str, limit: float) -> Run:
+    return Run(status=status, upper=None, lower=None, seconds=0.0, engine="", certificate=0, limit=limit)
 
 
 def _bytes(problem: cb.Problem, verdict: cb.Verdict, limit: float) -> int:
