@@ -26,8 +26,8 @@ from scipy.sparse.linalg import splu
 
 import certbound as cb
 from certbound.problem.model import compile_numpy
-from certbound.values.continuous.coefficients import squared_diffusion
 from certbound.values.discrete import bound_failure
+from certbound.values.enclosing import squared_diffusion
 from experiments import values_continuous, values_discrete
 from experiments.values_continuous import line_problems, plane_problems
 

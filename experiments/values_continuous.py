@@ -63,7 +63,7 @@ def truth(problem: cb.Problem, cells: int = 2000, steps: int = 2000) -> float:
 
 def _solved(problem: cb.Problem, cells: int, steps: int) -> float:
     from certbound.problem.model import compile_numpy
-    from certbound.values.continuous.coefficients import squared_diffusion
+    from certbound.values.enclosing import squared_diffusion
 
     region = problem.safe[0].region
     x = np.linspace(region.low[0], region.high[0], cells + 1)

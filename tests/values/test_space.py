@@ -159,6 +159,16 @@ def test_a_product_of_lines_is_bounded_within_its_factor(monkeypatch: pytest.Mon
     assert "three states" in found.words
 
 
+def test_a_proposal_that_runs_off_proves_nothing() -> None:
+    system = cb.ContinuousSystem(
+        lambda x: [2 * (x[1] - x[0]), x[0] * (0.5 - x[2]) - x[1], x[0] * x[1] - x[2]], states=3,
+        diffusion=0.2 * np.eye(3),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1.5] * 3, [1.5] * 3))]
+    problem = cb.Problem(system, initial=cb.Box([-0.2] * 3, [0.2] * 3), safe=safe, horizon=2)
+    assert bound_exits(problem, seconds=1.0).upper == 0  # a matrix without an inverse ended it
+
+
 def test_a_state_without_limits_gets_ends_beyond_simulated_paths() -> None:
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1], 0 * x[2]], states=3, diffusion=0.4 * np.eye(3))
     safe = [cb.Inside(cb.Box([-1, -1, -np.inf], [1, 1, 2]))]

@@ -75,7 +75,10 @@ def integrated(solver: Stepper) -> Surface | None:
         step = (end - begin) / steps
         for part in range(steps):
             poll("a proposal of the value function")
-            value = solver.step(begin + part * step, value, step)
+            try:
+                value = solver.step(begin + part * step, value, step)
+            except ZeroDivisionError:  # V has run off, and a matrix has no inverse
+                return None
         if not np.isfinite(value).all() or value.max() > 30:
             return None
         values.append(value)
