@@ -16,8 +16,11 @@ from certbound.problem.model import Tape
 _HALF = 0.5
 
 
-def run(tape: Tape, inputs: Sequence[Batch]) -> list[Batch]:
-    """The outputs of a tape on N boxes; unknown where an operation is undefined or jumps somewhere on a box."""
+def run(tape: Tape, inputs: Sequence[Batch], *, clock: bool = False) -> list[Batch]:
+    """The outputs of a tape on N boxes; unknown where an operation is undefined or jumps somewhere on a box.
+
+    With ``clock``, what jumps by the first input alone has all values that it takes on the box.
+    """
     values: list[Batch] = []
     like = inputs[0]
     ended, most = tape.lives()

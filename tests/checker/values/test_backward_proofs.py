@@ -18,8 +18,8 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.report import unlimited
 from certbound.checker.statement import read_model
-from certbound.checker.values.kolmogorov import patch_residual
-from certbound.checker.values.kolmogorov.patch_residual import Solution
+from certbound.checker.values.kolmogorov import patch_residual, solution
+from certbound.checker.values.kolmogorov.solution import Stage, Solution
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines, to_powers
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, compile_numpy
@@ -58,8 +58,8 @@ def space() -> cb.Problem:
     return cb.Problem(system, initial=[0, 0, 0], safe=[cb.Inside(cb.Box([-1] * 3, [1] * 3))], horizon=1.0)
 
 
-def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator, size: float = 1.0) -> Solution:
-    """A proof whose v is anything on uneven nodes."""
+def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator, size: float = 1.0) -> Stage:
+    """A stage whose v is anything on uneven nodes."""
     n = problem.system.dimension
     axes = tuple(np.sort(np.concatenate([[-0.9, 0.9], rng.uniform(-0.9, 0.9, cells - 1)])) for _ in range(n))
     times = np.sort(np.concatenate([[0.0, 1.0], rng.uniform(0, 1, slabs - 1)]))
@@ -68,9 +68,9 @@ def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator,
     made = Splines(axes=axes, times=times, values=rows[0], rates=rows[1], budget=unlimited())
     proof = {"engine": "backward", "axes": exact([list(a) for a in axes]), "times": exact(times),
              "units": exact([1.0, 1.0]), "values": "", "rates": "", "eta": exact([1e9] * slabs)}  # fmt: skip
-    with patch.object(patch_residual, "read_splines", lambda *_: made):
+    with patch.object(solution, "read_splines", lambda *_: made):
         model = read_model(json.loads(json.dumps(problem_data(problem))), unlimited())
-        return Solution(model, proof, unlimited(), upper=True)
+        return Solution(model, proof, unlimited(), upper=True).stages[0]
 
 
 def value(splines: Splines, t: float, x: np.ndarray, orders: tuple[int, ...], rate: bool = False) -> float:
@@ -110,11 +110,11 @@ def generator(problem: cb.Problem, splines: Splines, t: float, x: np.ndarray) ->
 @pytest.mark.parametrize("level", [0, 1])
 def test_the_residual_lies_below_its_bound_everywhere_on_a_patch(build, cells: int, level: int) -> None:
     problem, rng = build(), np.random.default_rng(level)
-    solution = rough(problem, cells, 2, rng)
-    splines, n = solution.splines, problem.system.dimension
+    stage = rough(problem, cells, 2, rng)
+    splines, n = stage.splines, problem.system.dimension
     shape = (*(count * 2**level for count in splines.cells), splines.slabs)
     *places, slab = np.unravel_index(np.arange(np.prod(shape)), shape)
-    need = solution._needs(slab, places, level)
+    need = stage.residual._needs(slab, places, level)
     for number in rng.choice(len(slab), 8, replace=False):
         k, seen = slab[number], -np.inf
         ends = [np.interp(np.array([p, p + 1]) / 2**level, np.arange(len(axis)), axis)
@@ -129,12 +129,12 @@ def test_the_residual_lies_below_its_bound_everywhere_on_a_patch(build, cells: i
 
 def test_a_bound_is_close_where_patches_are_small() -> None:
     problem, rng = sheared(), np.random.default_rng(5)
-    solution = rough(problem, 3, 1, rng)
+    stage = rough(problem, 3, 1, rng)
     found = []
     for level in range(4):
-        shape = tuple(count * 2**level for count in solution.splines.cells)
+        shape = tuple(count * 2**level for count in stage.splines.cells)
         places = np.unravel_index(np.arange(np.prod(shape)), shape)
-        found.append(solution._needs(0 * places[0], places, level).max())
+        found.append(stage.residual._needs(0 * places[0], places, level).max())
     assert np.all(np.diff(found) <= 1e-9 * found[0])
     assert found[-2] - found[-1] < 0.05 * (found[0] - found[-1]) + 1e-9 * found[0]
 
@@ -142,11 +142,11 @@ def test_a_bound_is_close_where_patches_are_small() -> None:
 @pytest.mark.parametrize(("build", "cells"), [(sheared, 3), (space, 1)])
 def test_on_a_small_part_of_a_cell_the_bound_is_the_residual_itself(build, cells: int) -> None:
     problem, rng = build(), np.random.default_rng(3)
-    solution = rough(problem, cells, 1, rng)
-    splines, n = solution.splines, problem.system.dimension
+    stage = rough(problem, cells, 1, rng)
+    splines, n = stage.splines, problem.system.dimension
     splines.values[1], splines.rates[:] = splines.values[0], 0.0
     chosen = rng.integers(0, 2**7 * cells, size=(n, 40))
-    need = solution._needs(np.zeros(40, dtype=int), list(chosen), 7)
+    need = stage.residual._needs(np.zeros(40, dtype=int), list(chosen), 7)
     middle = [np.interp((place + 0.5) / 2**7, np.arange(len(a)), a) for a, place in zip(splines.axes, chosen)]
     seen = np.array([generator(problem, splines, 0.5, x) for x in np.array(middle).T])
     assert np.sum(seen > 0) > 10
@@ -154,13 +154,13 @@ def test_on_a_small_part_of_a_cell_the_bound_is_the_residual_itself(build, cells
 
 
 def test_parts_of_patches_cover_them_where_the_file_states_too_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    solution = rough(sheared(), 3, 2, np.random.default_rng(9))
+    stage = rough(sheared(), 3, 2, np.random.default_rng(9))
     monkeypatch.setattr(patch_residual, "_DEEPEST", 1)
-    solution.stated[:] = -1.0
-    shape = (*(2 * count for count in solution.splines.cells), 2)
+    stage.residual.stated[:] = -1.0
+    shape = (*(2 * count for count in stage.splines.cells), 2)
     *places, slab = np.unravel_index(np.arange(np.prod(shape)), shape)
-    need = solution._needs(slab, places, 1)
-    assert solution._payments() == pytest.approx([need[slab == k].max() for k in (0, 1)])
+    need = stage.residual._needs(slab, places, 1)
+    assert stage.residual.payments() == pytest.approx([need[slab == k].max() for k in (0, 1)])
 
 
 def blossom(knots: list[Fraction], coefficients: list[Fraction], arguments: list[Fraction]) -> Fraction:
@@ -223,8 +223,8 @@ def test_v_on_a_face_is_that_of_its_outermost_coefficients() -> None:
 def test_v_lies_above_its_lower_bound_and_below_its_upper_one_at_starts(level: int) -> None:
     problem, rng = space(), np.random.default_rng(level)
     splines = rough(problem, 2, 1, rng).splines
-    solution = rough(problem, 2, 1, rng)
-    splines = solution.splines
+    stage = rough(problem, 2, 1, rng)
+    splines = stage.splines
     shape = tuple(count * 2**level for count in splines.cells)
     places = np.unravel_index(np.arange(np.prod(shape)), shape)
     least = splines.patches(0 * places[0], places, level).lowest()
@@ -235,11 +235,11 @@ def test_v_lies_above_its_lower_bound_and_below_its_upper_one_at_starts(level: i
             x = np.array([low + s * (high - low) for (low, high), s in zip(ends, share[1:])])
             assert value(splines, share[0], x, (0, 0, 0)) >= least[number] - 1e-9
     low, high = np.array([-0.5, -0.3, 0.1]), np.array([0.2, -0.3, 0.8])
-    most = solution._most_over([(arb(a), arb(b)) for a, b in zip(low.tolist(), high.tolist())])
+    most = stage.most_over([(arb(a), arb(b)) for a, b in zip(low.tolist(), high.tolist())])
     seen = max(value(splines, 0.0, low + s * (high - low), (0, 0, 0)) for s in rng.random((300, 3)))
     assert seen <= most
     point = [(arb(a), arb(a)) for a in low.tolist()]
-    assert solution._most_over(point) == pytest.approx(value(splines, 0.0, low, (0, 0, 0)), abs=1e-7)
+    assert stage.most_over(point) == pytest.approx(value(splines, 0.0, low, (0, 0, 0)), abs=1e-7)
 
 
 # ---- whole files ---------------------------------------------------------------------------------------------
