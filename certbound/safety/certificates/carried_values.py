@@ -23,11 +23,10 @@ from certbound.safety.certificates.step_values import (
     claimed,
     claimed_below,
     some_starts,
-    stretched,
 )
 
 if TYPE_CHECKING:
-    from certbound.values.kolmogorov import RoundedSide, Witness
+    from certbound.values.kolmogorov import RoundedSide, RoundedStage, Witness
 
 _SHARE = 1e-3  # of a bound, by which rounding may raise it
 _OF_ROOM = 0.2  # of the distance to delta, by which it may
@@ -56,8 +55,7 @@ def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 
     if not found.bound < 0:
         raise CertificateError("no function was found that bounds the probability from below.")
     level = claimed_below(math.log10(-found.bound), problem.delta, room)
-    found = replace(found, axes=tuple(stretched(axis, INWARD) for axis in found.axes))
-    return _stated(found) | {"side": "lower", "starts": exact(some_starts(problem))}, level, []
+    return _stated(_outward(found)) | {"side": "lower", "starts": exact(some_starts(problem))}, level, []
 
 
 def _rounded(problem: Problem, answer: EngineAnswer, attempt: int, *, above: bool) -> tuple[RoundedSide, float]:
@@ -95,17 +93,35 @@ def _refuse(problem: Problem) -> None:
         raise CertificateError("no certificate of the backward equation states a disturbance yet.")
     if any(node.op == "input" and node.args[0] == 0 for tape in tapes for node in tape.nodes):
         raise CertificateError("no certificate of the backward equation states a model that changes with time yet.")
-    if problem.initial.random or problem.ending or problem.reach is not None or problem.endless:
-        raise CertificateError("no certificate of the backward equation states random starts or targets yet.")
+    if problem.initial.random:
+        raise CertificateError("no certificate of the backward equation states random starts yet.")
+
+
+def _outward(found: RoundedSide) -> RoundedSide:
+    """With nodes a little beyond the limits and the target where they stood on them: whatever lies beyond is off."""
+    steps = [INWARD * max(float(np.ptp(one.axes[k])) for one in found.stages) for k in range(len(found.outward))]
+    stages = []
+    for one in found.stages:
+        axes = [axis.copy() for axis in one.axes]
+        for axis, given, marks, step in zip(axes, one.axes, found.outward, steps):
+            for place, sign in marks:
+                axis[given == place] += sign * step
+        stages.append(replace(one, axes=tuple(axes)))
+    return replace(found, stages=tuple(stages))
 
 
 def _stated(found: RoundedSide) -> dict[str, Any]:
-    values, rates = (_packed(rows) for rows in (found.values, found.rates))
-    if len(values) + len(rates) > _MOST_BYTES:
+    stages = [_stage(one) for one in found.stages]
+    if sum(len(one["values"]) + len(one["rates"]) for one in stages) > _MOST_BYTES:
         raise CertificateError(f"the function takes over {_MOST_BYTES / 1e6:g} MB: too much for a certificate.")
+    return {"engine": "backward", **(stages[0] if len(stages) == 1 else {"stages": stages})}
+
+
+def _stage(one: RoundedStage) -> dict[str, Any]:
+    values, rates = (_packed(rows) for rows in (one.values, one.rates))
     return {
-        "engine": "backward", "axes": [exact(axis) for axis in found.axes], "times": exact(found.times),
-        "units": exact(list(found.units)), "values": values, "rates": rates, "eta": exact(found.eta),
+        "axes": [exact(axis) for axis in one.axes], "times": exact(one.times), "units": exact(list(one.units)),
+        "values": values, "rates": rates, "eta": exact(one.eta),
     }  # fmt: skip
 
 
