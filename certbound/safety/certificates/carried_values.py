@@ -12,9 +12,7 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import CertificateError
-from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.step_values import (
     INWARD,
@@ -55,7 +53,10 @@ def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 
     if not found.bound < 0:
         raise CertificateError("no function was found that bounds the probability from below.")
     level = claimed_below(math.log10(-found.bound), problem.delta, room)
-    return _stated(_outward(found)) | {"side": "lower", "starts": exact(some_starts(problem))}, level, []
+    more = {"side": "lower", "starts": exact(some_starts(problem))}
+    if problem.system.disturbance is not None:
+        more["disturbances"] = exact(found.disturbances)
+    return _stated(_outward(found)) | more, level, []
 
 
 def _rounded(problem: Problem, answer: EngineAnswer, attempt: int, *, above: bool) -> tuple[RoundedSide, float]:
@@ -86,13 +87,6 @@ def coarsest(problem: Problem, kept: list[Witness]) -> Witness:
 
 def _refuse(problem: Problem) -> None:
     """Refuse, in words, what the checker does not treat yet."""
-    system = problem.system
-    assert isinstance(system, ContinuousSystem)
-    tapes = [problem.closed_loop, *([system.diffusion] if isinstance(system.diffusion, Tape) else [])]
-    if system.disturbance is not None:
-        raise CertificateError("no certificate of the backward equation states a disturbance yet.")
-    if any(node.op == "input" and node.args[0] == 0 for tape in tapes for node in tape.nodes):
-        raise CertificateError("no certificate of the backward equation states a model that changes with time yet.")
     if problem.initial.random:
         raise CertificateError("no certificate of the backward equation states random starts yet.")
 

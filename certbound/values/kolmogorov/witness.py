@@ -22,6 +22,7 @@ from certbound.watch import poll
 
 _SOLVER = ("mesh", "carrier", "maps", "carried_maps", "sketch", "policy")
 _FINER = 2  # bits more, where rounded coefficients raise the bound by more than there is room for
+_BRIEF = 0.1  # of the room, over all slabs, that these may cost without a closer look
 _MOST_BITS = 42  # of a whole number: five differences of such have 15 digits at most
 
 
@@ -53,12 +54,14 @@ class RoundedStage:
 class RoundedSide:
     """The stages of a side in their order, and its bound: P <= bound from above, P >= -bound from below.
 
-    ``outward`` holds, for each axis, the places of limits and of faces of the target, and the sign of the way out.
+    ``outward`` holds, for each axis, the places of limits and of faces of the target, and the sign of the way out;
+    ``disturbances``, shape (V, m), those of which from below one serves each cell and slab.
     """
 
     stages: tuple[RoundedStage, ...]
     bound: float
     outward: tuple[tuple[tuple[float, int], ...], ...]
+    disturbances: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -101,23 +104,26 @@ class Witness:
         while True:
             poll("rounding a solution for the certificate")
             units = (2.0 ** exponents[0], 2.0 ** exponents[1])
-            found = self._proved(units, room / span)
+            found = self._proved(units, room)
             largest = max(float(np.abs(one.values).max()) for one in found.stages)
             if found.bound <= self.bound + room or largest > 2.0**_MOST_BITS:
                 return found
             exponents = [exponent - _FINER for exponent in exponents]
 
-    def _proved(self, units: tuple[float, float], least: float) -> RoundedSide:
+    def _proved(self, units: tuple[float, float], room: float) -> RoundedSide:
         stages, left, later = list[RoundedStage](), 0.0, None
+        slabs = sum(len(one.steps) for one in self.side.stages)
         for one in reversed(self.side.stages):
             later, rounded = _rounded(one, units, later)
             eta = np.array([float(rows.max()) for rows in later.residuals()])
             lengths = one.steps if one.clock is None else one.steps * (1 + one.clock)
             left += float(np.dot(lengths, eta)) + later.lacking()
-            stages.insert(0, replace(rounded, eta=np.maximum(eta[::-1], least)))
+            least = room * np.maximum(1 / self.horizon, _BRIEF / (slabs * lengths))  # a closer look is not worth it
+            stages.insert(0, replace(rounded, eta=np.maximum(eta, least)[::-1]))
         return RoundedSide(
             stages=tuple(stages), bound=(self.value + units[0] / 2 + left) * (1 + 1e-9) + 1e-15,
             outward=_outward([one.setting for one in self.side.stages], self.side.row),
+            disturbances=self.side.setting.nodes,
         )  # fmt: skip
 
 

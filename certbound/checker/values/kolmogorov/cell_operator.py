@@ -21,11 +21,12 @@ from certbound.checker.statement import Model
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batch_tapes import run
 from certbound.checker.values.batches import Array, Batch, Index, Mask, Terms, terms
-from certbound.problem.model import Tape
+from certbound.problem.model import Node, Tape
 
 Orders = tuple[int, ...]
 Generator = list[tuple[Orders, float, Batch]]
 Acting = tuple[float, ...]
+Slabs = tuple[Array, Index]
 
 _DEGREES = {2: 5, 3: 4}
 """Degree of the Taylor models by the number of states."""
@@ -35,6 +36,8 @@ TOGETHER = 4096
 """Parts of cells that are looked at together."""
 _TERMS = 56
 """Monomials with which so many are."""
+_IN_TIME = 15
+"""Degree of what reads time alone: on slabs beside a bend or a jump it must be known on which side they are."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,24 +97,29 @@ class Operator:
         which, states = self.terms(acting), []
         for k, (axis, place) in enumerate(zip(grid.axes, places)):
             states.append(_part(tm.variable(which, k, *_ends(axis, place >> level)), k, place, level))
-        time = self._time(which, grid.times, slab, states[0])
+        slabs = (grid.times, slab)
         found: Generator = []
-        for i, rate in enumerate(self._drift(time, states, acting)):
+        for i, rate in enumerate(self._drift(slabs, states, acting)):
             found.append((_order(self.n, i), 1.0, rate))
-        squares = self._squares(time, states)
+        squares = self._squares(slabs, states)
         for i, j in itertools.combinations_with_replacement(range(self.n), 2):
             found.append((_order(self.n, i, j), 0.5 if i == j else 1.0, squares[i][j]))
         found = [(orders, weight, self._trimmed(one)) for orders, weight, one in found]
         return [one for one in found if one[2].coefficients.any() or one[2].error.any()]
 
-    def _time(self, which: Terms, times: Array, slab: Index, like: Batch) -> Batch:
-        if not self.timed:
-            return tm.fixed(which, np.zeros(like.error.shape))
-        return tm.variable(which, self.n, *_ends(times, slab))
+    def _run(self, tape: Tape, slabs: Slabs, states: Sequence[Batch], rows: Sequence[Batch]) -> list[Batch]:
+        """A tape; what reads time alone comes from a table of all slabs."""
+        which, shape = states[0].terms, states[0].error.shape
+        known = {}
+        if self.timed:
+            number, (times, slab) = self.n, slabs
+            clock: Clock = self.budget.once(times, ("clock", id(tape)), lambda: Clock(tape, times, self.budget))
+            known = clock.on(which, number, slab)
+        return run(tape, [tm.fixed(which, np.zeros(shape)), *states, *rows], known=known)
 
-    def _drift(self, time: Batch, states: Sequence[Batch], acting: Acting | None) -> list[Batch]:
+    def _drift(self, slabs: Slabs, states: Sequence[Batch], acting: Acting | None) -> list[Batch]:
         """f."""
-        which, shape, rows = time.terms, time.error.shape, []
+        which, shape, rows = states[0].terms, states[0].error.shape, []
         for k, (low, high) in enumerate(self.model.disturbance):
             if acting is not None:
                 rows.append(tm.fixed(which, np.full(shape, acting[k])))
@@ -120,17 +128,17 @@ class Operator:
                 rows.append(tm.variable(which, number, np.full(shape, low), np.full(shape, high)))
             else:
                 rows.append(tm.fixed(which, np.zeros(shape)))
-        return run(self.model.dynamics, [time, *states, *rows], clock=True)
+        return self._run(self.model.dynamics, slabs, states, rows)
 
-    def _squares(self, time: Batch, states: Sequence[Batch]) -> list[list[Batch]]:
+    def _squares(self, slabs: Slabs, states: Sequence[Batch]) -> list[list[Batch]]:
         """g g^T."""
-        given, n = self.model.noise.diffusion, self.n
+        given, n, like = self.model.noise.diffusion, self.n, states[0]
         columns = given.shape[1] if isinstance(given, Tape) else given.ncols()
-        self.budget.fits(8 * (n * columns + 2 * n * n) * time.coefficients.size)
+        self.budget.fits(8 * (n * columns + 2 * n * n) * like.coefficients.size)
         if isinstance(given, Tape):
-            entries = run(given, [time, *states], clock=True)
+            entries = self._run(given, slabs, states, [])
         else:
-            entries = [tm.fixed(time.terms, np.full(time.error.shape, float(x))) for x in given.entries()]
+            entries = [tm.fixed(like.terms, np.full(like.error.shape, float(x))) for x in given.entries()]
         rows = [entries[i * columns : (i + 1) * columns] for i in range(n)]
         return [[_summed([tm.mul(x, y) for x, y in zip(one, two)]) for two in rows] for one in rows]
 
@@ -186,9 +194,55 @@ class Operator:
             ends = [(np.full(len(number), min(place, inward)), np.full(len(number), max(place, inward))) if k == axis
                     else _ends(row, next(places)) for k, row in enumerate(grid.axes)]  # fmt: skip
             states = [tm.variable(which, k, *row) for k, row in enumerate(ends)]
-            time = self._time(which, grid.times, slab, states[0])
-            low, high = self._drift(time, states, None)[axis].ends()
+            low, high = self._drift((grid.times, slab), states, None)[axis].ends()
             yield ~(low > 0) if side == 0 else ~(high < 0)
+
+
+class Clock:
+    """What a tape makes of time alone, on every slab: Taylor models of one variable and of a high degree.
+
+    Parameters
+    ----------
+    tape : Tape
+        Over time and more.
+    times : ndarray
+        Ends of the slabs.
+    budget : Budget
+    """
+
+    def __init__(self, tape: Tape, times: Array, budget: Budget) -> None:
+        found = dict[int, int]()
+        nodes = list[Node]()
+        for index, node in enumerate(tape.nodes):
+            is_time = node.op == "input" and node.args[0] == 0
+            if is_time or node.op == "const" or (node.op != "input" and all(arg in found for arg in node.args)):
+                found[index] = len(nodes)
+                nodes.append(node if is_time else node._replace(args=tuple(found[arg] for arg in node.args)))
+        self.own = {index for index in found if tape.nodes[index].op != "const"}
+        read = {arg for index, node in enumerate(tape.nodes) if index not in found and node.op != "input"
+                for arg in node.args} | set(tape.outputs)  # fmt: skip
+        self.read = sorted(self.own & read)
+        outputs = tuple(found[index] for index in self.read)
+        part = Tape(inputs=tape.inputs[:1], nodes=tuple(nodes), outputs=outputs, shape=(len(outputs),))
+        which = terms(1, _IN_TIME, budget)
+        budget.take(8 * (len(outputs) + 1) * which.numbers(len(times)))
+        values = run(part, [tm.variable(which, 0, times[:-1], times[1:])], clock=True)
+        self.values, self.budget = dict(zip(self.read, values)), budget
+
+    def on(self, which: Terms, number: int, slab: Index) -> dict[int, Batch]:
+        """The same in other variables, of which time is one, on boxes in these slabs."""
+        powers = [tuple(k if i == number else 0 for i in range(which.variables)) for k in range(which.degree + 1)]
+        places = [which.exponents.index(row) for row in powers]
+        nothing = tm.fixed(which, np.zeros(0))
+        found = dict.fromkeys(self.own, nothing)
+        for index, value in self.values.items():
+            self.budget.fits(8 * which.numbers(len(slab)))
+            self.budget.floats(2 * which.numbers(len(slab)), 20)
+            coefficients = np.zeros((len(which.exponents), len(slab)))
+            coefficients[places] = value.coefficients[: which.degree + 1, slab]
+            error = value.error + np.abs(value.coefficients[which.degree + 1 :]).sum(axis=0) * (1 + 2.0**-40)
+            found[index] = Batch(which, coefficients, error[slab])
+        return found
 
 
 def about(sides: Sequence[tuple[arb, arb]]) -> tuple[list[arb], list[arb]]:

@@ -97,10 +97,8 @@ class Solution:
             raise Unproved("this proof treats two and three states in continuous time")
         if model.ends or model.stays or model.hold is not None or model.plan is not None:
             raise Unproved("this proof treats no plan with steps in time, and no path that ends unharmed")
-        if model.disturbance or model.initial.covariance is not None:
-            raise Unproved("this proof treats no disturbance and no random start")
-        if Operator(model, self.budget).timed:
-            raise Unproved("this proof does not treat a model that changes with time")
+        if model.initial.covariance is not None:
+            raise Unproved("this proof treats no random start")
         if not end_of(model) > 0:
             raise Unproved("this proof treats no target that counts at the first moment alone")
 
