@@ -13,6 +13,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.errors import CertificateError
 from certbound.problem.problem import Problem
+from certbound.problem.sets import GaussianStart
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.step_values import (
     INWARD,
@@ -43,7 +44,7 @@ def backward_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> 
     if not found.bound < 1:
         raise CertificateError("no function was found that bounds the probability below 1.")
     level = claimed(math.log10(max(found.bound, 1e-300)), problem.delta, room)
-    return _stated(found), level, []
+    return _stated(found) | _law(problem), level, []
 
 
 def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
@@ -53,7 +54,9 @@ def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 
     if not found.bound < 0:
         raise CertificateError("no function was found that bounds the probability from below.")
     level = claimed_below(math.log10(-found.bound), problem.delta, room)
-    more = {"side": "lower", "starts": exact(some_starts(problem))}
+    more: dict[str, Any] = {"side": "lower"} | _law(problem)
+    if not problem.initial.random:
+        more["starts"] = exact(some_starts(problem))
     if problem.system.disturbance is not None:
         more["disturbances"] = exact(found.disturbances)
     return _stated(_outward(found)) | more, level, []
@@ -61,7 +64,6 @@ def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 
 
 def _rounded(problem: Problem, answer: EngineAnswer, attempt: int, *, above: bool) -> tuple[RoundedSide, float]:
     """The coarsest function that proves what the best one does, rounded; and the room of the claim."""
-    _refuse(problem)
     known: tuple[Witness, ...] = getattr(answer.details, "witnesses", ())
     kept = [one for one in known if one.side.above == above]
     if not kept:
@@ -85,10 +87,18 @@ def coarsest(problem: Problem, kept: list[Witness]) -> Witness:
     return next(one for one in kept if one.bound <= enough)
 
 
-def _refuse(problem: Problem) -> None:
-    """Refuse, in words, what the checker does not treat yet."""
-    if problem.initial.random:
-        raise CertificateError("no certificate of the backward equation states random starts yet.")
+def _law(problem: Problem) -> dict[str, Any]:
+    """Directions in which a normal start varies independently, and in how many parts each is cut; else nothing."""
+    from certbound.values.kolmogorov import CELLS, directions_of
+
+    start = problem.initial
+    if not isinstance(start, GaussianStart):
+        return {}
+    found = directions_of(start)
+    count = len(found.rows)
+    if not count:
+        raise CertificateError("no certificate of the backward equation states a random start that does not vary.")
+    return {"gains": exact(found.gains), "rows": exact(found.rows), "parts": CELLS[count]}
 
 
 def _outward(found: RoundedSide) -> RoundedSide:

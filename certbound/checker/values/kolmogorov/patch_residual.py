@@ -161,7 +161,7 @@ class Residual:
         rounded, missed = 12 / patches.step * SUMS[0] ** n, patches.off.copy()
         sums = 8 * sum(shape) + 400 + 8 * monomials
         for orders, weight, model in models:
-            slope = _derivative(powers, orders)
+            slope = derivative(powers, orders)
             scale = np.full(count, weight)
             for half, order in zip(patches.half, orders):
                 scale = scale / half**order
@@ -228,7 +228,7 @@ def _risen(slopes: Array) -> Array:
     return np.stack([first, (first + 2 * middle) / 3, (2 * middle + last) / 3, last])
 
 
-def _derivative(powers: Array, orders: Orders) -> Array:
+def derivative(powers: Array, orders: Orders) -> Array:
     """Coefficients of a derivative by xi."""
     for axis, order in enumerate(orders, 1):
         for _ in range(order):

@@ -40,6 +40,7 @@ from certbound.checker.values.kolmogorov.cell_operator import TOGETHER, Acting, 
 from certbound.checker.values.kolmogorov.patch_residual import SUMS, UNIT, UP, Residual
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines, read_splines
 from certbound.checker.values.kolmogorov.stage_limits import StageLimits, common, end_of, faces
+from certbound.checker.values.kolmogorov.start_mean import StartMean
 from certbound.errors import CertificateError
 
 MOST_STAGES = 50
@@ -67,7 +68,9 @@ class Solution:
 
     def __init__(self, model: Model, value: object, budget: Budget, *, upper: bool) -> None:
         staged = isinstance(value, dict) and "stages" in value
-        more = [] if upper else ["side", "starts"]
+        random = model.initial.covariance is not None
+        more = [] if upper else ["side"] if random else ["side", "starts"]
+        more += ["gains", "rows", "parts"] if random else []
         more += ["disturbances"] if model.disturbance and not upper else []
         self.record = record = Record(value, "proof", ["engine", *(["stages"] if staged else _OWN), *more])
         self.model, self.budget, self.above, self.n = model, budget, upper, model.dimension
@@ -85,6 +88,7 @@ class Solution:
             raise CertificateError(
                 "`proof.times` must begin at 0 and end at the horizon (the end of the target's window), stage by stage."
             )
+        self.start = StartMean(model, record, budget) if random else None
         self.stages = [
             Stage(model, self.operator, splines, np.array(one.array("eta", splines.slabs)), actings, upper=upper)
             for splines, one in given
@@ -97,8 +101,6 @@ class Solution:
             raise Unproved("this proof treats two and three states in continuous time")
         if model.ends or model.stays or model.hold is not None or model.plan is not None:
             raise Unproved("this proof treats no plan with steps in time, and no path that ends unharmed")
-        if model.initial.covariance is not None:
-            raise Unproved("this proof treats no random start")
         if not end_of(model) > 0:
             raise Unproved("this proof treats no target that counts at the first moment alone")
 
@@ -135,6 +137,10 @@ class Solution:
     def _at_starts(self) -> float:
         """At least v(0, .) on the initial set, or (lower) at the best of the stated starts."""
         first, initial = self.stages[0], self.model.initial
+        if self.start is not None:
+            if not first.limits.begins_alike if self.above else first.over.any():
+                raise Unproved("a random start is treated without a target or a limit of the first moment alone")
+            return self.start.bound(first)
         if self.above:
             box = list(zip(initial.low, initial.high))
             if not first.limits.at_begin().holds(*about(box), strictly=True):

@@ -15,6 +15,7 @@ So from above too little is over and too much fails, from below the other way ro
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -72,9 +73,16 @@ class StageLimits:
         return SafeSet(replace(self.model, constraints=tuple(replace(c, during=None) for c in kept)), bounded=False)
 
     def at_begin(self) -> SafeSet:
-        """From above: the constraints of the stage, and those that hold at its first moment."""
-        more = self._held(lambda window: window[0] <= self.span[0] <= window[1])
-        return self._set([*self.kept, *(c for c in more if not any(c is one for one in self.kept))])
+        """The constraints that hold at its first moment, from above with those of all of the stage."""
+        first = self._held(lambda window: window[0] <= self.span[0] <= window[1])
+        more = [c for c in self.kept if not any(c is one for one in first)] if self.above else []
+        return self._set([*first, *more])
+
+    @property
+    def begins_alike(self) -> bool:
+        """Whether all constraints of its first moment are of the stage."""
+        first = self._held(lambda window: window[0] <= self.span[0] <= window[1])
+        return all(any(c is one for one in self.kept) for c in first)
 
     @cached_property
     def target(self) -> SafeSet | None:
@@ -123,22 +131,38 @@ class StageLimits:
         return self.target.excludes(centre, radius)
 
     def _on_cells(self, holds: Callable[..., bool], fails: Callable[..., bool]) -> Mask:
-        """Cells on which something holds: on blocks of cells at once, where it does or fails on all of a block."""
-        found = np.zeros([len(axis) - 1 for axis in self.axes], dtype=bool)
-        blocks = [[(0, size) for size in found.shape]]
-        while blocks:
-            block = blocks.pop()
-            self.budget.box()
-            box = about([(arb(float(axis[a])), arb(float(axis[b]))) for axis, (a, b) in zip(self.axes, block)])
-            if holds(*box):
-                found[tuple(slice(a, b) for a, b in block)] = True
-                continue
-            widest = max(range(len(block)), key=lambda k: block[k][1] - block[k][0])
-            low, high = block[widest]
-            if high - low > 1 and not fails(*box):
-                middle = (low + high) // 2
-                blocks += [[*block[:widest], part, *block[widest + 1 :]] for part in ((low, middle), (middle, high))]
-        return found
+        """Cells on which something holds."""
+
+        def box(block: Sequence[tuple[int, int]]) -> list[tuple[arb, arb]]:
+            return [(arb(float(axis[a])), arb(float(axis[b]))) for axis, (a, b) in zip(self.axes, block)]
+
+        return marked([len(axis) - 1 for axis in self.axes], box, holds, fails, self.budget)
+
+
+def marked(
+    shape: Sequence[int], box: Callable[[Sequence[tuple[int, int]]], Sequence[tuple[arb, arb]]],
+    holds: Callable[..., bool], fails: Callable[..., bool], budget: Budget,
+) -> Mask:  # fmt: skip
+    """Cells of a grid on which something holds: of a block of cells at once, where it does or fails on all of it.
+
+    ``box`` gives the ends of what lies in a block.
+    """
+    budget.fits(math.prod(shape))
+    found = np.zeros(shape, dtype=bool)
+    blocks = [[(0, size) for size in shape]]
+    while blocks:
+        block = blocks.pop()
+        budget.box()
+        sides = about(box(block))
+        if holds(*sides):
+            found[tuple(slice(a, b) for a, b in block)] = True
+            continue
+        widest = max(range(len(block)), key=lambda k: block[k][1] - block[k][0])
+        low, high = block[widest]
+        if high - low > 1 and not fails(*sides):
+            middle = (low + high) // 2
+            blocks += [[*block[:widest], part, *block[widest + 1 :]] for part in ((low, middle), (middle, high))]
+    return found
 
 
 def common(axes: Sequence[Array], others: Sequence[Array]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
