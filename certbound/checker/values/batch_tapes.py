@@ -18,17 +18,16 @@ _UP = 1 + 2.0**-40
 
 
 def run(
-    tape: Tape, inputs: Sequence[Batch], *, known: Mapping[int, Batch] | None = None, clock: bool = False
+    tape: Tape, inputs: Sequence[Batch], *, known: Mapping[int, Batch] | None = None, jumps: bool = False
 ) -> list[Batch]:
     """The outputs of a tape on N boxes; unknown where an operation is undefined or jumps somewhere on a box.
 
     Parameters
     ----------
     known : mapping, optional
-        Operations whose values are given: those of time, with ``clock``.
-    clock : bool
-        The only input is time: what jumps is known up to an error that covers both sides, as the one time of a jump has
-        no weight.
+        Operations whose values are given: those of time alone.
+    jumps : bool
+        Whether what jumps on a box is known up to an error that covers both sides; else just choices that time makes.
     """
     values: list[Batch] = []
     like = inputs[0]
@@ -53,24 +52,20 @@ def run(
             values.append(tm.composed(args[0], OPERATIONS[node.op].series))
         else:
             values.append(tm.unknown(like))  # atan2, parts of networks
-        if index not in known and node.op in JUMPS and (clock or node.args[0] in known):
-            values[index] = _on_both_sides(node.op, args, values[index], clock)
+        by_time = node.op == "if_else_zero" and node.args[0] in known
+        if node.op in JUMPS and index not in known and (jumps or by_time):
+            values[index] = _on_both_sides(node.op, args, values[index])
         for place in ended[index]:
             values[place] = nothing
     return [values[output] for output in tape.outputs]
 
 
-def _on_both_sides(op: str, args: Sequence[Batch], found: Batch, clock: bool) -> Batch:
-    """What jumps by time, up to an error where it does.
-
-    A choice that time makes lies between 0 and what is chosen; others must read time alone.
-    """
+def _on_both_sides(op: str, args: Sequence[Batch], found: Batch) -> Batch:
+    """What jumps, up to an error where it does: a choice lies between 0 and what is chosen, a truth between 0 and 1."""
     x = args[-1]
     if op == "if_else_zero":
         half = tm.scaled(x, _HALF)
         across = Batch(x.terms, half.coefficients, (half.error * 2 + np.abs(half.coefficients).sum(axis=0)) * _UP)
-    elif not clock:
-        return found
     elif op in ("sign", "floor"):
         low, high = _ends(x)
         first, last = (np.sign(low), np.sign(high)) if op == "sign" else (np.floor(low), np.floor(high))

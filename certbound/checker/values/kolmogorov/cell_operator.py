@@ -1,8 +1,9 @@
 """L = f . D + tr(a D^2) / 2, a = g g^T, on cells: Taylor models of f and of a, and the faces by which paths may leave.
 
 Variables of the models are the states and, where the model reads them, time on a slab and the disturbances on their
-intervals. Where disturbances are given (`acting`), they are numbers. What jumps by time alone has, on a slab that holds
-the jump, all values on either side: the one time of a jump has no weight.
+intervals. Where disturbances are given (`acting`), they are numbers. Where the drift jumps, by the state or by time, it
+has all values on either side: Ito's formula asks of v alone to be smooth. From below, where disturbances change with the
+state, a drift that jumps by the state is refused.
 """
 
 from __future__ import annotations
@@ -107,7 +108,9 @@ class Operator:
         found = [(orders, weight, self._trimmed(one)) for orders, weight, one in found]
         return [one for one in found if one[2].coefficients.any() or one[2].error.any()]
 
-    def _run(self, tape: Tape, slabs: Slabs, states: Sequence[Batch], rows: Sequence[Batch]) -> list[Batch]:
+    def _run(
+        self, tape: Tape, slabs: Slabs, states: Sequence[Batch], rows: Sequence[Batch], jumps: bool = False
+    ) -> list[Batch]:
         """A tape; what reads time alone comes from a table of all slabs."""
         which, shape = states[0].terms, states[0].error.shape
         known = {}
@@ -115,7 +118,7 @@ class Operator:
             number, (times, slab) = self.n, slabs
             clock: Clock = self.budget.once(times, ("clock", id(tape)), lambda: Clock(tape, times, self.budget))
             known = clock.on(which, number, slab)
-        return run(tape, [tm.fixed(which, np.zeros(shape)), *states, *rows], known=known)
+        return run(tape, [tm.fixed(which, np.zeros(shape)), *states, *rows], known=known, jumps=jumps)
 
     def _drift(self, slabs: Slabs, states: Sequence[Batch], acting: Acting | None) -> list[Batch]:
         """f."""
@@ -128,7 +131,7 @@ class Operator:
                 rows.append(tm.variable(which, number, np.full(shape, low), np.full(shape, high)))
             else:
                 rows.append(tm.fixed(which, np.zeros(shape)))
-        return self._run(self.model.dynamics, slabs, states, rows)
+        return self._run(self.model.dynamics, slabs, states, rows, jumps=acting is None or not self.free)
 
     def _squares(self, slabs: Slabs, states: Sequence[Batch]) -> list[list[Batch]]:
         """g g^T."""
@@ -226,7 +229,7 @@ class Clock:
         part = Tape(inputs=tape.inputs[:1], nodes=tuple(nodes), outputs=outputs, shape=(len(outputs),))
         which = terms(1, _IN_TIME, budget)
         budget.take(8 * (len(outputs) + 1) * which.numbers(len(times)))
-        values = run(part, [tm.variable(which, 0, times[:-1], times[1:])], clock=True)
+        values = run(part, [tm.variable(which, 0, times[:-1], times[1:])], jumps=True)
         self.values, self.budget = dict(zip(self.read, values)), budget
 
     def on(self, which: Terms, number: int, slab: Index) -> dict[int, Batch]:
