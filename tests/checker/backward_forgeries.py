@@ -129,7 +129,9 @@ def _(data: Data) -> None:
     _scale(data["problem"]["constraints"][0]["region"]["high"], 0, 0.9999)
 
 
-@forges("a start of a solution touches no obstacle", "solved", _PROOF, "Solution._at_starts", "initial set was not shown")
+@forges(
+    "a start of a solution touches no obstacle", "solved", _PROOF, "Solution._at_starts", "initial set was not shown"
+)
 def _(data: Data) -> None:
     wall = {"kind": "halfspace", "normal": exact([1.0, 0.0]), "bound": exact(0.5)}
     data["problem"]["constraints"].append({"kind": "outside", "region": wall, "during": None, "label": "a wall"})

@@ -64,8 +64,8 @@ def _on_both_sides(op: str, args: Sequence[Batch], found: Batch) -> Batch:
     """What jumps, up to an error where it does: a choice lies between 0 and what is chosen, a truth between 0 and 1."""
     x = args[-1]
     if op == "if_else_zero":
-        half = tm.scaled(x, _HALF)
-        across = Batch(x.terms, half.coefficients, (half.error * 2 + np.abs(half.coefficients).sum(axis=0)) * _UP)
+        part = tm.scaled(x, _HALF)
+        across = Batch(x.terms, part.coefficients, (part.error * 2 + np.abs(part.coefficients).sum(axis=0)) * _UP)
     elif op in ("sign", "floor"):
         low, high = _ends(x)
         first, last = (np.sign(low), np.sign(high)) if op == "sign" else (np.floor(low), np.floor(high))

@@ -41,8 +41,8 @@ _UP = 1 + 1e-10
 class Directions:
     """X_0 within ``mean`` + ``gains`` z + {|e| <= ``slack``}, but for ``missed``; z = ``rows`` (X_0 - ``mean``).
 
-    Shapes (n,), (n, d), (n,), (d, n). The density of z is that of a standard normal vector times a factor between ``under`` and
-    ``over``, where |z_k| <= 9.
+    Shapes (n,), (n, d), (n,), (d, n). The density of z is that of a standard normal vector times a factor between
+    ``under`` and ``over``, where |z_k| <= 9.
     """
 
     mean: Array
@@ -84,7 +84,8 @@ def directions_of(start: GaussianStart) -> Directions:
     far = _tail(_FAR / np.sqrt(1 + distortion) * (1 - 1e-12))
     square = d * _FAR**2
     return Directions(
-        mean=np.asarray(start.mean, dtype=float), gains=gains, rows=rows, slack=_FAR * np.sqrt(variance) * _UP + rounding,
+        mean=np.asarray(start.mean, dtype=float), gains=gains, rows=rows,
+        slack=_FAR * np.sqrt(variance) * _UP + rounding,
         missed=2 * far * (d + int(np.count_nonzero(variance))) * _UP,
         under=(1 + distortion) ** (-d / 2) * np.exp(-distortion * square / (2 * (1 - distortion))) / _UP,
         over=(1 - distortion) ** (-d / 2) * np.exp(distortion * square / (2 * (1 + distortion))) * _UP,

@@ -92,9 +92,8 @@ class Witness:
             return ()
         kept = _without_solver(side)
         kept.values, kept.rates = side.best.values, side.best.rates
-        return (
-            cls(side=kept, value=side.best.value, bound=side.best.bound, horizon=float(side.stages[-1].setting.horizon)),
-        )
+        horizon = float(side.stages[-1].setting.horizon)
+        return (cls(side=kept, value=side.best.value, bound=side.best.bound, horizon=horizon),)
 
     def rounded(self, room: float) -> RoundedSide:
         """v with as few digits as raise its bound by at most ``room``; proved by the engine's own inequality."""
@@ -140,7 +139,8 @@ def _without_solver(side: Side) -> Side:
 def _outward(stages: Sequence[Setting], row: int) -> tuple[tuple[tuple[float, int], ...], ...]:
     marks: list[set[tuple[float, int]]] = [set() for _ in stages[0].noisy]
     for one in stages:
-        pairs = [(np.where(one.limited, (one.low[row], one.high[row]), np.inf)), (one.due_low[row], one.due_high[row])]
+        pairs = [np.where(one.limited, np.array([one.low[row], one.high[row]]), np.inf)]
+        pairs += [np.array([one.due_low[row], one.due_high[row]])]
         pairs += [] if one.target is None else [one.target[:, row]]
         for pair, (side, sign) in product(pairs, enumerate((-1, 1))):
             for own, place in zip(marks, pair[side]):
@@ -156,8 +156,8 @@ def _slope(side: Side) -> float:
     """By how much the residual may move for a unit of the coefficients, largest over the cells."""
     total = np.zeros(())
     large = [1.0 if one is None else float(one.size.max()) for one in side.factors]
-    for orders, field, weight, product in side.generator.terms:
-        size = weight * large[product] * field.magnitude
+    for orders, field, weight, number in side.generator.terms:
+        size = weight * large[number] * field.magnitude
         for axis, (one, order) in enumerate(zip(side.axes, orders)):
             size = size / one.widths.reshape([-1 if k == axis else 1 for k in range(len(orders))]) ** order
         total = total + size

@@ -19,8 +19,8 @@ from certbound.checker import check_data, parse
 from certbound.checker.report import unlimited
 from certbound.checker.statement import read_model
 from certbound.checker.values.kolmogorov import patch_residual, solution
-from certbound.checker.values.kolmogorov.solution import Stage, Solution
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines, to_powers
+from certbound.checker.values.kolmogorov.solution import Solution, Stage
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, compile_numpy
 from certbound.safety.answers import EngineAnswer, exact

@@ -1,9 +1,9 @@
 """L = f . D + tr(a D^2) / 2, a = g g^T, on cells: Taylor models of f and of a, and the faces by which paths may leave.
 
 Variables of the models are the states and, where the model reads them, time on a slab and the disturbances on their
-intervals. Where disturbances are given (`acting`), they are numbers. Where the drift jumps, by the state or by time, it
-has all values on either side: Ito's formula asks of v alone to be smooth. From below, where disturbances change with the
-state, a drift that jumps by the state is refused.
+intervals. Where disturbances are given (`acting`), they are numbers. Where the drift jumps, by the state or by time,
+it has all values on either side: Ito's formula asks of v alone to be smooth. From below, where disturbances change
+with the state, a drift that jumps by the state is refused.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ import numpy as np
 
 from certbound.checker.report import Budget, Unproved
 from certbound.checker.values.batches import Array, Index, Mask, bernstein
-from certbound.checker.values.kolmogorov.cell_operator import TOGETHER, Acting, Generator, Grid, Operator, Orders
+from certbound.checker.values.kolmogorov.cell_operator import Acting, Generator, Grid, Operator, Orders
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Patches, Splines, along
 
 SUMS = (32.0, 80.0, 160.0)
@@ -153,7 +153,7 @@ class Residual:
         )  # fmt: skip
         powers = patches.powers()
         total = np.zeros((*shape, count))
-        inner = (slice(None), *[slice(0, DEGREE + 1)] * n, *[0] * (len(shape) - 1 - n))
+        inner: tuple[slice | int, ...] = (slice(None), *[slice(0, DEGREE + 1)] * n, *[0] * (len(shape) - 1 - n))
         rates = _risen(np.diff(powers, axis=0) * (3 / patches.step))
         raised = _products(more).sum(axis=0)
         total[inner] = np.tensordot(raised, rates, axes=(1, 0)) if more else rates
@@ -172,9 +172,9 @@ class Residual:
             largest = np.abs(slope).sum(axis=tuple(range(1, n + 1))).max(axis=0) + ROUNDED * size
             missed = missed + model.error[which] * largest
             rounded = rounded + np.abs(own).sum(axis=0) * scale * math.prod(SUMS[order] for order in orders)
-        for axis, size in enumerate(shape[1:], 1):
-            if size > 1:
-                total = along(bernstein(size - 1), total, axis)
+        for axis, length in enumerate(shape[1:], 1):
+            if length > 1:
+                total = along(bernstein(length - 1), total, axis)
         high = total.reshape(-1, count).max(axis=0)
         found = high + (missed + rounded * patches.size * (2 * ROUNDED + sums * UNIT)
                         + sums * UNIT * np.abs(patches.speeds).max(axis=0)) * UP  # fmt: skip
@@ -190,7 +190,9 @@ class Residual:
                 groups.setdefault((*powers[:n], *powers[n + timed :]), []).append((powers[n] if timed else 0, row))
         weights = _products(more)
         for powers, rows in groups.items():
-            place = (*(slice(e, e + size) for e, size in zip(powers, slope.shape[1:-1])), *powers[n:])
+            place: tuple[slice | int, ...] = (
+                *(slice(e, e + size) for e, size in zip(powers, slope.shape[1:-1])), *powers[n:],
+            )  # fmt: skip
             if not more:
                 total[(slice(None), *place)] += rows[0][1] * slope
                 continue
@@ -205,7 +207,7 @@ def _tops(models: Generator, variables: int) -> Orders:
     """The largest power of every variable in the models."""
     tops = [0] * variables
     for *_, model in models:
-        for powers, there in zip(model.terms.exponents, model.coefficients.any(axis=1)):
+        for powers, there in zip(model.terms.exponents, np.any(model.coefficients, axis=1).tolist()):
             if there:
                 tops = [max(pair) for pair in zip(tops, powers)]
     return tuple(tops)

@@ -3,11 +3,11 @@
 The file states matrices L (``gains``) and B (``rows``), and z = B (X_0 - m), X_0 = m + L z + e. With M = B S B^T and
 delta the largest row sum of |M - I|, the density of z is that of a standard normal vector times a number between
 
-    (1 + delta)^(-d/2) exp(-delta d R^2 / (2 (1 - delta)))    and    (1 - delta)^(-d/2) exp(delta d R^2 / (2 (1 + delta)))
+    (1 + delta)^(-d/2) exp(-delta d R^2 / (2 (1 - delta)))   and   (1 - delta)^(-d/2) exp(delta d R^2 / (2 (1 + delta)))
 
 where no |z_k| exceeds R, which it does with a probability of at most erfc(R / sqrt(2 (1 + delta))) each; and |e_k| is
-at most slack_k = R sqrt(((I - L B) S (I - L B)^T)_kk) but for erfc(R / sqrt 2) each. On a cell of a grid in z with sides
-w, v(0, m + L z + e) is off the multilinear interpolation of its values at the corners by at most
+at most slack_k = R sqrt(((I - L B) S (I - L B)^T)_kk) but for erfc(R / sqrt 2) each. On a cell of a grid in z with
+sides w, v(0, m + L z + e) is off the multilinear interpolation of its values at the corners by at most
 
     w^2 / 8 sum_k sup |sum_ij L_ik L_jk v_ij| + sum_k slack_k sup |v_k|,
 
