@@ -15,6 +15,7 @@ from tests.checker.forgeries import _BASES, Data, _scale, _sharp, forges
 LESS = "less than the claimed|no bound above 0"
 MORE = "more than the claimed"
 _PROOF, _SPLINES = "values/kolmogorov/solution.py", "values/kolmogorov/patches.py"
+_TAPES = "values/batch_tapes.py"
 _RESIDUAL, _CELLS = "values/kolmogorov/patch_residual.py", "values/kolmogorov/cell_operator.py"
 
 _BASES |= {
@@ -28,9 +29,9 @@ _BASES |= {
 }
 
 
-def changed(data: Data, name: str, change: Callable[[np.ndarray], None]) -> None:
+def changed(data: Data, name: str, change: Callable[[np.ndarray], None], stage: int = 0) -> None:
     """Change the whole numbers of a packed array, time first."""
-    proof = data["proof"]
+    proof = data["proof"]["stages"][stage] if "stages" in data["proof"] else data["proof"]
     shape = (len(proof["times"]), *(len(axis) + 4 for axis in proof["axes"]))
     words = zlib.decompress(base64.b64decode(proof[name])).decode().split(" ")
     found = np.array(list(map(int, words))).reshape(shape)
@@ -43,14 +44,21 @@ def changed(data: Data, name: str, change: Callable[[np.ndarray], None]) -> None
     proof[name] = base64.b64encode(zlib.compress(" ".join(map(str, found.ravel().tolist())).encode())).decode()
 
 
-def moved(data: Data, place: tuple, amount: float, name: str = "values") -> None:
+def moved(data: Data, place: tuple, amount: float, name: str = "values", stage: int = 0) -> None:
     """Add to some of the coefficients."""
-    unit = float.fromhex(data["proof"]["units"][name == "rates"])
+    proof = data["proof"]["stages"][stage] if "stages" in data["proof"] else data["proof"]
+    unit = float.fromhex(proof["units"][name == "rates"])
 
     def change(found: np.ndarray) -> None:
         found[place] += round(amount / unit)
 
-    changed(data, name, change)
+    changed(data, name, change, stage)
+
+
+def uncut(data: Data) -> None:
+    """State so large an eta that no patch is looked at more closely."""
+    for proof in data["proof"].get("stages", [data["proof"]]):
+        proof["eta"] = exact([1e9] * len(proof["eta"]))
 
 
 # ---- from above ----------------------------------------------------------------------------------------------
@@ -166,28 +174,27 @@ def _(data: Data) -> None:
     data["problem"]["noise"]["diffusion"] = exact([[0.3, 0.0], [0.03, 0.3]])
 
 
-@forges("nothing is known of the residual where the drift jumps", "solved", _RESIDUAL, "Residual.payments", "defined")
+@forges("nothing is known of the residual where the drift is not", "solved", _RESIDUAL, "Residual.payments", "defined")
 def _(data: Data) -> None:
     tape = data["problem"]["dynamics"]
     count = len(tape["nodes"])
     tape["nodes"] += [
-        ["input", 1], ["const", exact(-1.5)], ["add", count, count + 1], ["sign", count + 2], ["const", exact(1e-12)],
-        ["mul", count + 3, count + 4], ["add", tape["outputs"][0], count + 5],
+        ["input", 1], ["const", exact(-1.5)], ["add", count, count + 1], ["const", exact(1e-12)],
+        ["div", count + 3, count + 2], ["add", tape["outputs"][0], count + 4],
     ]  # fmt: skip
-    tape["outputs"][0] = count + 6
+    tape["outputs"][0] = count + 5
 
 
-@forges("a solution knows no disturbance", "solved", _PROOF, "Solution._refuse", "no disturbance")
-def _(data: Data) -> None:
-    data["problem"] |= {"disturbances": ["d"], "disturbance_set": [exact([-0.1, 0.1])]}
-
-
-@forges("a solution knows no model that changes with time", "solved", _PROOF, "Solution._refuse", "changes with time")
+@forges("where the drift jumps it has all values on either side", "solved", _TAPES, "_on_both_sides", MORE)
 def _(data: Data) -> None:
     tape = data["problem"]["dynamics"]
     count = len(tape["nodes"])
-    tape["nodes"] += [["input", 0], ["add", tape["outputs"][0], count]]
-    tape["outputs"][0] = count + 1
+    tape["nodes"] += [
+        ["input", 1], ["const", exact(-1.5)], ["add", count, count + 1], ["sign", count + 2], ["const", exact(1e-2)],
+        ["mul", count + 3, count + 4], ["add", tape["outputs"][0], count + 5],
+    ]  # fmt: skip
+    tape["outputs"][0] = count + 6
+    uncut(data)
 
 
 # ---- from below ----------------------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ from certbound.errors import CertificateError
 if TYPE_CHECKING:
     from certbound.checker.values.kolmogorov.solution import Stage
 
-MOST_CELLS = 1_000_000
+MOST_CELLS, MOST_PARTS = 1_000_000, 20_000
 _FAR = 9.0
 """R: 2e-19 lies beyond."""
 _MOST_OFF = 1e-3
@@ -70,7 +70,7 @@ class StartMean:
         if not 1 <= d <= n:
             raise CertificateError(f"`proof.rows` must have 1 to {n} entries, got {d}.")
         gains = record.array("gains", n, d)
-        count = record.whole("parts", 1, MOST_CELLS)
+        count = record.whole("parts", 1, MOST_PARTS)
         if count**d > MOST_CELLS:
             raise CertificateError(f"`proof.parts` must make at most {MOST_CELLS} cells, {d} directions together.")
         self.gains, self.mean, self.count = np.array(gains), np.array(model.initial.centre), count
