@@ -15,7 +15,7 @@ from tests.checker.forgeries import _BASES, Data, _scale, _sharp, forges
 LESS = "less than the claimed|no bound above 0"
 MORE = "more than the claimed"
 _PROOF, _SPLINES = "values/kolmogorov/solution.py", "values/kolmogorov/patches.py"
-_TAPES = "values/batch_tapes.py"
+_TAPES, _STAGE = "values/batch_tapes.py", "values/kolmogorov/stage.py"
 _RESIDUAL, _CELLS = "values/kolmogorov/patch_residual.py", "values/kolmogorov/cell_operator.py"
 
 _BASES |= {
@@ -112,7 +112,7 @@ def _(data: Data) -> None:
     data["proof"]["values"] = base64.b64encode(zlib.compress(b" ".join(words))).decode()
 
 
-@forges("v reaches 1 where paths leave", "solved", _PROOF, "Stage._at_face", MORE)
+@forges("v reaches 1 where paths leave", "solved", _STAGE, "Stage._at_face", MORE)
 def _(data: Data) -> None:
     moved(data, (slice(None), slice(None), 0), -0.2)
 
@@ -127,12 +127,12 @@ def _(data: Data) -> None:
     data["problem"]["noise"]["diffusion"] = exact([[1e-9], [0.5]])
 
 
-@forges("v is at least 0 at the horizon", "solved", _PROOF, "Stage._at_end", MORE)
+@forges("v is at least 0 at the horizon", "solved", _STAGE, "Stage._at_end", MORE)
 def _(data: Data) -> None:
     moved(data, (-1, 10, 9), -0.5)
 
 
-@forges("the grid of a solution lies in the safe set", "solved", _PROOF, "Stage.check_box", "grid was not shown")
+@forges("the grid of a solution lies in the safe set", "solved", _STAGE, "Stage.check_box", "grid was not shown")
 def _(data: Data) -> None:
     _scale(data["problem"]["constraints"][0]["region"]["high"], 0, 0.9999)
 
@@ -146,13 +146,13 @@ def _(data: Data) -> None:
     data["problem"]["initial"] |= {"low": exact([0.5, 0.6]), "high": exact([0.5, 0.6])}
 
 
-@forges("the grid of a solution holds the starts", "solved", _PROOF, "Stage.most_over", "lie in the grid")
+@forges("the grid of a solution holds the starts", "solved", _STAGE, "Stage.most_over", "lie in the grid")
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["high"] = exact([3.0, 3.0])
     data["problem"]["initial"] |= {"low": exact([2.7, 0.6]), "high": exact([2.7, 0.6])}
 
 
-@forges("v is what it is at every start", "solved", _PROOF, "Stage._most_of", MORE)
+@forges("v is what it is at every start", "solved", _STAGE, "Stage._most_of", MORE)
 def _(data: Data) -> None:
     data["problem"]["initial"]["low"] = exact([1.4, 0.5])
 
@@ -205,27 +205,27 @@ def _(data: Data) -> None:
     moved(data, (12, 8, 6), -0.1)
 
 
-@forges("paths fail only by faces that break a constraint", "solved below", _PROOF, "Stage._at_face", LESS)
+@forges("paths fail only by faces that break a constraint", "solved below", _STAGE, "Stage._at_face", LESS)
 def _(data: Data) -> None:
     _scale(data["problem"]["constraints"][0]["region"]["high"], 0, 1.0001)
 
 
-@forges("v exceeds -1 where paths fail", "swung below", _PROOF, "Stage._at_face", LESS)
+@forges("v exceeds -1 where paths fail", "swung below", _STAGE, "Stage._at_face", LESS)
 def _(data: Data) -> None:
     moved(data, (slice(None), -1, slice(12, None)), -0.01)
 
 
-@forges("v is at least 0 where paths leave and do not fail", "swung below", _PROOF, "Stage._at_face", LESS)
+@forges("v is at least 0 where paths leave and do not fail", "swung below", _STAGE, "Stage._at_face", LESS)
 def _(data: Data) -> None:
     moved(data, (slice(None), slice(None), -1), -0.01)
 
 
-@forges("v is at least 0 at the horizon from below", "solved below", _PROOF, "Stage._at_end", LESS)
+@forges("v is at least 0 at the horizon from below", "solved below", _STAGE, "Stage._at_end", LESS)
 def _(data: Data) -> None:
     moved(data, (-1, 8, 6), -0.05)
 
 
-@forges("v is what it is at a stated start", "solved below", _PROOF, "Stage._most_of", LESS)
+@forges("v is what it is at a stated start", "solved below", _STAGE, "Stage._most_of", LESS)
 def _(data: Data) -> None:
     data["problem"]["initial"] |= {"low": exact([1.49, 0.61]), "high": exact([1.49, 0.61])}
     data["proof"]["starts"] = exact([[1.49, 0.61]])

@@ -12,6 +12,7 @@ from tests.checker.forgeries import _BASES, Data, _scale, _sharp, forges
 _PROOF, _LIMITS = "values/kolmogorov/solution.py", "values/kolmogorov/stage_limits.py"
 _RESIDUAL, _CELLS = "values/kolmogorov/patch_residual.py", "values/kolmogorov/cell_operator.py"
 _START, _TAPES = "values/kolmogorov/start_mean.py", "values/batch_tapes.py"
+_STAGE = "values/kolmogorov/stage.py"
 _FINE = {"cell": 0.12, "steps": 12}
 
 _BASES |= {
@@ -45,12 +46,12 @@ def constant(data: Data, value: float, factor: float, part: str = "dynamics") ->
 # ---- stages of time ------------------------------------------------------------------------------------------
 
 
-@forges("where a stage ends v is at least the next one", "gated", _PROOF, "Stage._below_next", MORE)
+@forges("where a stage ends v is at least the next one", "gated", _STAGE, "Stage._below_next", MORE)
 def _(data: Data) -> None:
     moved(data, (-1, place_of(data, 0, 0.1), place_of(data, 1, 0.1)), -0.1)
 
 
-@forges("where a limit is due v reaches 1 beyond it", "gated", _PROOF, "Stage._at_end", MORE)
+@forges("where a limit is due v reaches 1 beyond it", "gated", _STAGE, "Stage._at_end", MORE)
 def _(data: Data) -> None:
     moved(data, (-1, slice(place_of(data, 0, 0.9), None), slice(None)), -0.2)
 
@@ -80,7 +81,7 @@ def _(data: Data) -> None:
     _scale(data["proof"]["stages"][1]["axes"][0], 7, 1.0001)
 
 
-@forges("in every stage v reaches 1 where paths leave", "gated", _PROOF, "Stage._at_face", MORE)
+@forges("in every stage v reaches 1 where paths leave", "gated", _STAGE, "Stage._at_face", MORE)
 def _(data: Data) -> None:
     moved(data, (slice(None), slice(None), 0), -0.2, stage=1)
 
@@ -107,12 +108,12 @@ def _(data: Data) -> None:
     data["problem"]["constraints"][1]["during"] = exact([0.75, 0.75])
 
 
-@forges("where a stage ends v is at least the next one from below", "gated below", _PROOF, "Stage._below_next", LESS)
+@forges("where a stage ends v is at least the next one from below", "gated below", _STAGE, "Stage._below_next", LESS)
 def _(data: Data) -> None:
     moved(data, (-1, place_of(data, 0, 0.1), place_of(data, 1, 0.1)), -0.1)
 
 
-@forges("v exceeds -1 where a limit is due", "gated below", _PROOF, "Stage._at_end", LESS)
+@forges("v exceeds -1 where a limit is due", "gated below", _STAGE, "Stage._at_end", LESS)
 def _(data: Data) -> None:
     moved(data, (-1, slice(place_of(data, 0, 0.9), None), slice(None)), -0.2)
 
@@ -127,7 +128,7 @@ def _(data: Data) -> None:
 # ---- targets -------------------------------------------------------------------------------------------------
 
 
-@forges("v is at least 0 where paths meet the target", "arrived", _PROOF, "Stage._at_target", MORE)
+@forges("v is at least 0 where paths meet the target", "arrived", _STAGE, "Stage._at_target", MORE)
 def _(data: Data) -> None:
     moved(data, (slice(None), slice(place_of(data, 0, 0.8) - 2, None), slice(None)), -0.1)
 
@@ -150,7 +151,7 @@ def _(data: Data) -> None:
     uncut(data)
 
 
-@forges("v reaches 1 where a path has not met the target", "arrived", _PROOF, "Stage._at_end", MORE)
+@forges("v reaches 1 where a path has not met the target", "arrived", _STAGE, "Stage._at_end", MORE)
 def _(data: Data) -> None:
     moved(data, (-1, place_of(data, 0, 0.0), place_of(data, 1, 0.0)), -0.3)
 
@@ -165,13 +166,13 @@ def _(data: Data) -> None:
     _scale(data["problem"]["reach"]["region"]["low"], 0, 0.97)
 
 
-@forges("v is at least 0 where paths may meet the target", "arrived below", _PROOF, "Stage._at_target", LESS)
+@forges("v is at least 0 where paths may meet the target", "arrived below", _STAGE, "Stage._at_target", LESS)
 def _(data: Data) -> None:
     place = place_of(data, 0, 0.8)
     moved(data, (slice(None), slice(place - 2, place + 2), slice(None)), -0.1)
 
 
-@forges("a stated start may not lie in the target", "arrived below", _PROOF, "Stage.is_over", "keep off the target")
+@forges("a stated start may not lie in the target", "arrived below", _STAGE, "Stage.is_over", "keep off the target")
 def _(data: Data) -> None:
     data["problem"]["initial"] |= {"low": exact([0.9, 0.0]), "high": exact([0.9, 0.0])}
     data["proof"]["starts"] = exact([[0.9, 0.0]])

@@ -89,16 +89,15 @@ def coarsest(problem: Problem, kept: list[Witness]) -> Witness:
 
 def _law(problem: Problem) -> dict[str, Any]:
     """Directions in which a normal start varies independently, and in how many parts each is cut; else nothing."""
-    from certbound.values.kolmogorov import CELLS, directions_of
+    from certbound.values.kolmogorov import Witness
 
     start = problem.initial
     if not isinstance(start, GaussianStart):
         return {}
-    found = directions_of(start)
-    count = len(found.rows)
-    if not count:
+    found, parts = Witness.directions(start)
+    if not len(found.rows):
         raise CertificateError("no certificate of the backward equation states a random start that does not vary.")
-    return {"gains": exact(found.gains), "rows": exact(found.rows), "parts": CELLS[count]}
+    return {"gains": exact(found.gains), "rows": exact(found.rows), "parts": parts}
 
 
 def _outward(found: RoundedSide) -> RoundedSide:

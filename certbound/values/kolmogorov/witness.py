@@ -16,8 +16,10 @@ from itertools import product
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.problem.sets import GaussianStart
 from certbound.values.kolmogorov.box_setting import Setting
 from certbound.values.kolmogorov.carry import Side
+from certbound.values.kolmogorov.start_law import CELLS, Directions, directions_of
 from certbound.watch import poll
 
 _SOLVER = ("mesh", "carrier", "maps", "carried_maps", "sketch", "policy")
@@ -94,6 +96,12 @@ class Witness:
         kept.values, kept.rates = side.best.values, side.best.rates
         horizon = float(side.stages[-1].setting.horizon)
         return (cls(side=kept, value=side.best.value, bound=side.best.bound, horizon=horizon),)
+
+    @staticmethod
+    def directions(start: GaussianStart) -> tuple[Directions, int]:
+        """Those of a normal start in which the mean of v is bounded, and into how many parts each is cut."""
+        found = directions_of(start)
+        return found, CELLS.get(len(found.rows), 1)
 
     def rounded(self, room: float) -> RoundedSide:
         """v with as few digits as raise its bound by at most ``room``; proved by the engine's own inequality."""

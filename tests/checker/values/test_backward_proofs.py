@@ -22,7 +22,8 @@ from certbound.checker.statement import read_model
 from certbound.checker.values.kolmogorov import patch_residual, solution
 from certbound.checker.values.kolmogorov.cell_operator import Grid, Operator
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines, to_powers
-from certbound.checker.values.kolmogorov.solution import Solution, Stage
+from certbound.checker.values.kolmogorov.solution import Solution
+from certbound.checker.values.kolmogorov.stage import Stage
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, compile_numpy
 from certbound.safety.answers import EngineAnswer, exact

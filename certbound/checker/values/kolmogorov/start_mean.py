@@ -23,7 +23,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from flint import arb
@@ -36,11 +35,9 @@ from certbound.checker.values.batches import Array, Index, Mask, above, below
 from certbound.checker.values.kolmogorov.cell_operator import TOGETHER
 from certbound.checker.values.kolmogorov.patch_residual import SUMS, UNIT, derivative
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Patches
+from certbound.checker.values.kolmogorov.stage import Stage
 from certbound.checker.values.kolmogorov.stage_limits import marked
 from certbound.errors import CertificateError
-
-if TYPE_CHECKING:
-    from certbound.checker.values.kolmogorov.solution import Stage
 
 MOST_CELLS, MOST_PARTS = 1_000_000, 20_000
 _FAR = 9.0
