@@ -172,6 +172,7 @@ def _(data: Data) -> None:
 @forges("the residual has the noise of every pair of states", "solved", _CELLS, "Operator._squares", MORE)
 def _(data: Data) -> None:
     data["problem"]["noise"]["diffusion"] = exact([[0.3, 0.0], [0.03, 0.3]])
+    uncut(data)
 
 
 @forges("nothing is known of the residual where the drift is not", "solved", _RESIDUAL, "Residual.payments", "defined")
