@@ -655,13 +655,14 @@ def _() -> Data:
 
 @bomb("functions of time on sixteen thousand slabs of a solution", WORK)
 def _() -> Data:
-    dynamics = raised(tape(2, ["input", 0], *[["sin", k] for k in range(40)]), 40)
+    dynamics = raised(tape(2, ["input", 0], *[["sin", k] for k in range(4)]), 4)
     return file(problem(2, dynamics=dynamics), solution([1, 1], 16_384))
 
 
 @bomb("a target of many faces about the cells of a solution", WORK)
 def _() -> Data:
-    around = {**faces(2, 10_000), "kind": "reach"}
+    around = faces(2, 10_000)
+    around["kind"], around["region"]["b"] = "reach", [ZERO] * 10_000
     return file(problem(2, reach=around), solution([1024, 512], 1))
 
 
