@@ -54,6 +54,9 @@ WHOLE = ("lasting", "drift", "rate", "surely")
 STATED = "the stated constants hold"
 """How a certificate's own list names what `assumptions` derives from the proof."""
 
+FINITE = ("values", "backward")
+"""Those that prove targets up to a finite horizon."""
+
 MOST_CELLS = 200
 
 MOST_PRINTED = 4
@@ -180,7 +183,8 @@ def _is_whole(model: Model, proof: object) -> bool:
     engine = proof.get("engine") if isinstance(proof, Mapping) else None
     if model.stays:
         return engine == "values" and not model.continuous
-    return engine in WHOLE or (engine == "values" and not (model.continuous and math.isinf(model.horizon)))
+    lasts = model.continuous and math.isinf(model.horizon)
+    return engine in WHOLE or (engine in FINITE and not lasts)
 
 
 def _cells(

@@ -610,6 +610,62 @@ def _() -> Data:
     return file(problem(3, noise=noise), solution([120, 120, 120], 1))
 
 
+def raised(dynamics: Data, place: int) -> Data:
+    """The rate of the first state plus an operation."""
+    dynamics["nodes"].append(["add", dynamics["outputs"][0], place])
+    dynamics["outputs"][0] = len(dynamics["nodes"]) - 1
+    return dynamics
+
+
+def staged(many: int, cells: list[int], slabs: int) -> Data:
+    """A solution of many stages."""
+    stages, length = [], 1.0 / many
+    for k in range(many):
+        one = solution(cells, slabs)
+        del one["engine"]
+        one["times"] = hexed([(k + i / slabs) * length for i in range(slabs + 1)])
+        stages.append(one)
+    return {"engine": "backward", "stages": stages}
+
+
+@bomb("more stages of a solution than are read", "must have 1 to 50 entries")
+def _() -> Data:
+    return file(problem(2), staged(64, [1, 1], 1))
+
+
+@bomb("fifty stages whose patches are cut again and again", MORE)
+def _() -> Data:
+    return file(problem(2), staged(32, [64, 64], 16))
+
+
+@bomb("disturbances that are tried on every patch", MORE)
+def _() -> Data:
+    dynamics = raised(tape(2, ["input", 3]), 0)
+    proof = solution([128, 128], 32, lower=True, disturbances=[[ZERO]] * 64)
+    return file(problem(2, pushes=1, dynamics=dynamics), proof, lower=True)
+
+
+@bomb("monomials of four hundred disturbances", WORK)
+def _() -> Data:
+    dynamics = tape(2, *[["input", 3 + k] for k in range(400)])
+    for k in range(400):
+        dynamics = raised(dynamics, k)
+    return file(problem(2, pushes=400, dynamics=dynamics), solution([8, 8], 4))
+
+
+@bomb("functions of time on sixteen thousand slabs of a solution", WORK)
+def _() -> Data:
+    dynamics = raised(tape(2, ["input", 0], *[["sin", k] for k in range(4)]), 4)
+    return file(problem(2, dynamics=dynamics), solution([1, 1], 16_384))
+
+
+@bomb("a target of many faces about the cells of a solution", WORK)
+def _() -> Data:
+    around = faces(2, 10_000)
+    around["kind"], around["region"]["b"] = "reach", [ZERO] * 10_000
+    return file(problem(2, reach=around), solution([1024, 512], 1))
+
+
 @bomb("lists in the axes of a solution", "must be a number")
 def _() -> Data:
     return file(problem(2), solution([8, 8], 4, axes=[[[[ZERO]]] * 30_000] * 2))

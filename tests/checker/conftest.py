@@ -34,8 +34,8 @@ from certbound.values.continuous import bound_exits
 from certbound.values.continuous.line import ladder
 from certbound.values.kolmogorov import Bounds, Witness
 from certbound.values.kolmogorov.box_setting import stages_of
-from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import refined, starts_in
+from certbound.values.kolmogorov.door import side_of as solution_of
 
 
 @contextmanager
@@ -235,6 +235,45 @@ def predator() -> cb.Problem:
     return cb.Problem(system, initial=[1.0, 1.0], safe=safe, horizon=1.0, delta=0.3, name="predator")
 
 
+def gated(noise: float = 0.5, size: float = 0.7) -> cb.Problem:
+    """A wide limit at all times, and a tight one at one time."""
+    system = cb.ContinuousSystem(lambda x, y: [-x, -y], states=["x", "y"], diffusion=noise * np.eye(2))
+    safe = [cb.Inside(cb.Box([-1.5, -1.5], [1.5, 1.5])),
+            cb.Inside(cb.Box([-size, -size], [size, size]), during=(0.5, 0.5))]  # fmt: skip
+    return cb.Problem(system, initial=[0.2, 0.2], safe=safe, horizon=1.0, delta=0.2, name="gated")
+
+
+def loud_gated() -> cb.Problem:
+    """The same with so much noise that it often fails."""
+    return gated(1.0, 0.6)
+
+
+def arriving(during: tuple[float, float] | None = None) -> cb.Problem:
+    """A box, and a target behind one of its sides that noise must find."""
+    system = cb.ContinuousSystem(lambda x, y: [0.0, -y], states=["x", "y"], diffusion=0.8 * np.eye(2))
+    safe, ahead = [cb.Inside(cb.Box([-1, -1], [2, 1]))], cb.Reach(cb.Box([0.8, -1], [2, 1]), during=during)
+    return cb.Problem(system, initial=[-0.3, 0], safe=safe, reach=ahead, horizon=1.0, delta=0.2, name="arriving")
+
+
+def pushed() -> cb.Problem:
+    """A model that swings and jumps with time, under a disturbance."""
+    system = cb.ContinuousSystem(
+        lambda t, x, y, d: [-(1 + 0.5 * np.sin(3 * t)) * x + np.where(t < 0.6, 0.3, 0.1) + d, -y], states=["x", "y"],
+        diffusion=lambda t, x: [[0.8 + 0.16 * np.cos(t), 0.0], [0.0, 0.8]], disturbance=cb.Box([-0.2], [0.2]),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    return cb.Problem(system, initial=[0.2, 0.1], safe=safe, horizon=1.0, delta=0.8, name="pushed")
+
+
+def scattered() -> cb.Problem:
+    """A normal start whose states depend on each other."""
+    system = cb.ContinuousSystem(
+        lambda x, y: [-x + 0.3 * y, -y - 0.2 * x * y], states=["x", "y"], diffusion=np.eye(2)
+    )
+    start, safe = cb.GaussianStart([0.2, 0.1], [[0.04, 0.02], [0.02, 0.03]]), [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    return cb.Problem(system, initial=start, safe=safe, horizon=0.5, delta=0.8, name="scattered")
+
+
 @cache
 def backward_answer(
     build: Callable[[], cb.Problem], *, lower: bool, cell: float = 0.15, steps: int = 12
@@ -242,8 +281,9 @@ def backward_answer(
     """What the backward equation bounds on one coarse grid, for short checks."""
     problem = build()
     n = problem.system.dimension
-    side = Side(stages_of(problem)[0], np.full(n, cell), steps, not lower)
-    side.propose()
+    side = solution_of(stages_of(problem), cell, steps, not lower)
+    for stage in side.stages[::-1]:
+        stage.propose()
     bound = refined(side, starts_in(problem))[0]
     found = Bounds(
         lower=max(-bound, 0.0) if lower else 0.0, upper=1.0 if lower else bound, cells=(0,) * n, steps=steps, runs=1,

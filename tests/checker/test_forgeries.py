@@ -16,6 +16,7 @@ from tests.checker import (  # noqa: F401  # they enter themselves
     entering_forgeries,
     goal_forgeries,
     lasting_forgeries,
+    staged_forgeries,
     turned_forgeries,
     value_forgeries,
     window_forgeries,

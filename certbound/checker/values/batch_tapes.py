@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from flint import arb
@@ -11,22 +11,36 @@ from certbound.checker.expressions import OPERATIONS, Undecided
 from certbound.checker.report import FUNCTION, STEP
 from certbound.checker.values import batches as tm
 from certbound.checker.values.batches import Batch
-from certbound.problem.model import Tape
+from certbound.problem.model import JUMPS, Tape
 
 _HALF = 0.5
+_UP = 1 + 2.0**-40
 
 
-def run(tape: Tape, inputs: Sequence[Batch]) -> list[Batch]:
-    """The outputs of a tape on N boxes; unknown where an operation is undefined or jumps somewhere on a box."""
+def run(
+    tape: Tape, inputs: Sequence[Batch], *, known: Mapping[int, Batch] | None = None, jumps: bool = False
+) -> list[Batch]:
+    """The outputs of a tape on N boxes; unknown where an operation is undefined or jumps somewhere on a box.
+
+    Parameters
+    ----------
+    known : mapping, optional
+        Operations whose values are given: those of time alone.
+    jumps : bool
+        Whether what jumps on a box is known up to an error that covers both sides; else just choices that time makes.
+    """
     values: list[Batch] = []
     like = inputs[0]
     ended, most = tape.lives()
     like.terms.budget.spend(STEP * len(tape.nodes))
     like.terms.budget.fits(8 * (most + 8) * like.coefficients.size)
     nothing = tm.fixed(like.terms, np.zeros(0))
+    known = {} if known is None else known
     for index, node in enumerate(tape.nodes):
         args = [] if node.op == "input" else [values[arg] for arg in node.args]
-        if node.op == "input":
+        if index in known:
+            values.append(known[index])
+        elif node.op == "input":
             values.append(inputs[node.args[0]])
         elif node.op == "const":
             values.append(tm.fixed(like.terms, np.full(like.error.shape, node.value)))
@@ -38,9 +52,35 @@ def run(tape: Tape, inputs: Sequence[Batch]) -> list[Batch]:
             values.append(tm.composed(args[0], OPERATIONS[node.op].series))
         else:
             values.append(tm.unknown(like))  # atan2, parts of networks
+        by_time = node.op == "if_else_zero" and node.args[0] in known
+        if node.op in JUMPS and index not in known and (jumps or by_time):
+            values[index] = _on_both_sides(node.op, args, values[index])
         for place in ended[index]:
             values[place] = nothing
     return [values[output] for output in tape.outputs]
+
+
+def _on_both_sides(op: str, args: Sequence[Batch], found: Batch) -> Batch:
+    """What jumps, up to an error where it does: a choice lies between 0 and what is chosen, a truth between 0 and 1."""
+    x = args[-1]
+    if op == "if_else_zero":
+        part = tm.scaled(x, _HALF)
+        across = Batch(x.terms, part.coefficients, (part.error * 2 + np.abs(part.coefficients).sum(axis=0)) * _UP)
+    elif op in ("sign", "floor"):
+        low, high = _ends(x)
+        first, last = (np.sign(low), np.sign(high)) if op == "sign" else (np.floor(low), np.floor(high))
+        off = (np.abs(first) + np.abs(last)) * 2.0**-52
+        across = tm.fixed(x.terms, first / 2 + last / 2, ((last - first) * _HALF + off) * _UP)
+    else:
+        half = np.full(x.error.shape, _HALF)
+        across = tm.fixed(x.terms, half, half)
+    sure = np.isfinite(found.error) | ~np.logical_and.reduce([np.isfinite(arg.error) for arg in args])
+    return tm.known(tm.chosen(sure, found, across))
+
+
+def _ends(x: Batch) -> tuple[tm.Array, tm.Array]:
+    """Bounds of all values; of one variable sharp ones."""
+    return x.sharp_ends() if x.terms.variables == 1 else x.ends()
 
 
 def _power(x: Batch, exponent: float) -> Batch:
@@ -61,7 +101,7 @@ def _quotient(x: Batch, y: Batch) -> Batch:
 
 def _absolute(x: Batch) -> Batch:
     """|x|; across the kink a constant with an error."""
-    low, high = x.ends()
+    low, high = _ends(x)
     most = np.maximum(np.abs(low), np.abs(high)) / 2
     across = tm.fixed(x.terms, most, most * (1 + 1e-15))
     return tm.chosen(low >= 0, x, tm.chosen(high <= 0, tm.neg(x), tm.known(across)))
@@ -82,23 +122,23 @@ def _truth(like: Batch, holds: tm.Mask, fails: tm.Mask) -> Batch:
 
 
 def _less(x: Batch, y: Batch) -> Batch:
-    low, high = tm.sub(x, y).ends()
+    low, high = _ends(tm.sub(x, y))
     return _truth(x, high < 0, low >= 0)
 
 
 def _at_most(x: Batch, y: Batch) -> Batch:
-    low, high = tm.sub(x, y).ends()
+    low, high = _ends(tm.sub(x, y))
     return _truth(x, high <= 0, low > 0)
 
 
 def _equal(x: Batch, y: Batch) -> Batch:
-    low, high = tm.sub(x, y).ends()
+    low, high = _ends(tm.sub(x, y))
     return _truth(x, np.zeros(low.shape, dtype=bool), (high < 0) | (low > 0))
 
 
 def _decided(x: Batch) -> tuple[tm.Mask, tm.Mask]:
     """Where a condition surely is not 0, and where it surely is."""
-    low, high = x.ends()
+    low, high = _ends(x)
     zero = (x.coefficients == 0).all(axis=0) & (x.error == 0)
     return (low > 0) | (high < 0), zero
 
@@ -129,7 +169,7 @@ def _step(op: str) -> Callable[[Batch], Batch]:
 
     def apply(x: Batch) -> Batch:
         value, sure = np.zeros(x.error.shape), np.zeros(x.error.shape, dtype=bool)
-        low, high = x.ends()
+        low, high = _ends(x)
         x.terms.budget.balls(len(low), FUNCTION)
         for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high)):
             try:

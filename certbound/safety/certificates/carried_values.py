@@ -12,9 +12,8 @@ import numpy as np
 
 from certbound.arrays import Array
 from certbound.errors import CertificateError
-from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
-from certbound.problem.systems import ContinuousSystem
+from certbound.problem.sets import GaussianStart
 from certbound.safety.answers import EngineAnswer, Proof, exact
 from certbound.safety.certificates.step_values import (
     INWARD,
@@ -23,11 +22,10 @@ from certbound.safety.certificates.step_values import (
     claimed,
     claimed_below,
     some_starts,
-    stretched,
 )
 
 if TYPE_CHECKING:
-    from certbound.values.kolmogorov import RoundedSide, Witness
+    from certbound.values.kolmogorov import RoundedSide, RoundedStage, Witness
 
 _SHARE = 1e-3  # of a bound, by which rounding may raise it
 _OF_ROOM = 0.2  # of the distance to delta, by which it may
@@ -46,7 +44,7 @@ def backward_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> 
     if not found.bound < 1:
         raise CertificateError("no function was found that bounds the probability below 1.")
     level = claimed(math.log10(max(found.bound, 1e-300)), problem.delta, room)
-    return _stated(found), level, []
+    return _stated(found) | _law(problem), level, []
 
 
 def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
@@ -56,13 +54,16 @@ def backward_proof_below(problem: Problem, answer: EngineAnswer, attempt: int = 
     if not found.bound < 0:
         raise CertificateError("no function was found that bounds the probability from below.")
     level = claimed_below(math.log10(-found.bound), problem.delta, room)
-    found = replace(found, axes=tuple(stretched(axis, INWARD) for axis in found.axes))
-    return _stated(found) | {"side": "lower", "starts": exact(some_starts(problem))}, level, []
+    more: dict[str, Any] = {"side": "lower"} | _law(problem)
+    if not problem.initial.random:
+        more["starts"] = exact(some_starts(problem))
+    if problem.system.disturbance is not None:
+        more["disturbances"] = exact(found.disturbances)
+    return _stated(_outward(found)) | more, level, []
 
 
 def _rounded(problem: Problem, answer: EngineAnswer, attempt: int, *, above: bool) -> tuple[RoundedSide, float]:
     """The coarsest function that proves what the best one does, rounded; and the room of the claim."""
-    _refuse(problem)
     known: tuple[Witness, ...] = getattr(answer.details, "witnesses", ())
     kept = [one for one in known if one.side.above == above]
     if not kept:
@@ -86,26 +87,44 @@ def coarsest(problem: Problem, kept: list[Witness]) -> Witness:
     return next(one for one in kept if one.bound <= enough)
 
 
-def _refuse(problem: Problem) -> None:
-    """Refuse, in words, what the checker does not treat yet."""
-    system = problem.system
-    assert isinstance(system, ContinuousSystem)
-    tapes = [problem.closed_loop, *([system.diffusion] if isinstance(system.diffusion, Tape) else [])]
-    if system.disturbance is not None:
-        raise CertificateError("no certificate of the backward equation states a disturbance yet.")
-    if any(node.op == "input" and node.args[0] == 0 for tape in tapes for node in tape.nodes):
-        raise CertificateError("no certificate of the backward equation states a model that changes with time yet.")
-    if problem.initial.random or problem.ending or problem.reach is not None or problem.endless:
-        raise CertificateError("no certificate of the backward equation states random starts or targets yet.")
+def _law(problem: Problem) -> dict[str, Any]:
+    """Directions in which a normal start varies independently, and in how many parts each is cut; else nothing."""
+    from certbound.values.kolmogorov import Witness
+
+    start = problem.initial
+    if not isinstance(start, GaussianStart):
+        return {}
+    found, parts = Witness.directions(start)
+    if not len(found.rows):
+        raise CertificateError("no certificate of the backward equation states a random start that does not vary.")
+    return {"gains": exact(found.gains), "rows": exact(found.rows), "parts": parts}
+
+
+def _outward(found: RoundedSide) -> RoundedSide:
+    """With nodes a little beyond the limits and the target where they stood on them: whatever lies beyond is off."""
+    steps = [INWARD * max(float(np.ptp(one.axes[k])) for one in found.stages) for k in range(len(found.outward))]
+    stages = []
+    for one in found.stages:
+        axes = [axis.copy() for axis in one.axes]
+        for axis, given, marks, step in zip(axes, one.axes, found.outward, steps):
+            for place, sign in marks:
+                axis[given == place] += sign * step
+        stages.append(replace(one, axes=tuple(axes)))
+    return replace(found, stages=tuple(stages))
 
 
 def _stated(found: RoundedSide) -> dict[str, Any]:
-    values, rates = (_packed(rows) for rows in (found.values, found.rates))
-    if len(values) + len(rates) > _MOST_BYTES:
+    stages = [_stage(one) for one in found.stages]
+    if sum(len(one["values"]) + len(one["rates"]) for one in stages) > _MOST_BYTES:
         raise CertificateError(f"the function takes over {_MOST_BYTES / 1e6:g} MB: too much for a certificate.")
+    return {"engine": "backward", **(stages[0] if len(stages) == 1 else {"stages": stages})}
+
+
+def _stage(one: RoundedStage) -> dict[str, Any]:
+    values, rates = (_packed(rows) for rows in (one.values, one.rates))
     return {
-        "engine": "backward", "axes": [exact(axis) for axis in found.axes], "times": exact(found.times),
-        "units": exact(list(found.units)), "values": values, "rates": rates, "eta": exact(found.eta),
+        "axes": [exact(axis) for axis in one.axes], "times": exact(one.times), "units": exact(list(one.units)),
+        "values": values, "rates": rates, "eta": exact(one.eta),
     }  # fmt: skip
 
 

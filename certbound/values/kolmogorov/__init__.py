@@ -8,6 +8,6 @@ carried), ``start_law`` (normal starts), ``door``.
 """
 
 from certbound.values.kolmogorov.door import Bounds, bound_failing
-from certbound.values.kolmogorov.witness import RoundedSide, Witness
+from certbound.values.kolmogorov.witness import RoundedSide, RoundedStage, Witness
 
-__all__ = ["bound_failing", "Bounds", "RoundedSide", "Witness"]
+__all__ = ["bound_failing", "Bounds", "RoundedSide", "RoundedStage", "Witness"]

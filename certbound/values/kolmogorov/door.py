@@ -170,7 +170,7 @@ class Search:
 
     def _refined(self, side: Side, budget: float) -> Side:
         """Prove a bound on one grid, after better axes; the side on these."""
-        above, setting = side.above, self.setting
+        above = side.above
         rounds = 0 if above in self.shapes or side.later is not None else _ROUNDS
         side, residuals = adapted(side, self.starts, rounds)
         self.estimate = abs(largest_at_start(side, self.starts)[0])
@@ -180,7 +180,7 @@ class Search:
             self.shapes[above] = (self.cell, better_shapes(side, residuals, self.starts.places))
         bound, value, passes = refined(side, self.starts, target, residuals)
         self.work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
-        self.kept += () if setting.changing or setting.staged or self.starts.means else Witness.of(side)
+        self.kept += Witness.of(side)
         self.carried = abs(abs(value) - self.estimate)
         if above:
             self.upper = min(self.upper, bound)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from certbound.values.kolmogorov.carry import Side
 
 _FAR = 9.0  # deviations up to which the grid reaches: 2e-19 lies beyond
-_CELLS = {1: 2000, 2: 300, 3: 70}  # along each direction, by their number
+CELLS = {1: 2000, 2: 300, 3: 70}  # along each direction, by their number
 _SINGULAR = 1e-9  # of the correlations' eigenvalues: what is less belongs to the rest
 _TOGETHER = 20000  # points
 _UP = 1 + 1e-10
@@ -39,14 +39,15 @@ _UP = 1 + 1e-10
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Directions:
-    """X_0 within ``mean`` + ``gains`` z + {|e| <= ``slack``}, but for ``missed``.
+    """X_0 within ``mean`` + ``gains`` z + {|e| <= ``slack``}, but for ``missed``; z = ``rows`` (X_0 - ``mean``).
 
-    Shapes (n,), (n, d), (n,). The density of z is that of a standard normal vector times a factor between ``under`` and
-    ``over``, where |z_k| <= 9.
+    Shapes (n,), (n, d), (n,), (d, n). The density of z is that of a standard normal vector times a factor between
+    ``under`` and ``over``, where |z_k| <= 9.
     """
 
     mean: Array
     gains: Array
+    rows: Array
     slack: Array
     missed: float
     under: float
@@ -83,7 +84,8 @@ def directions_of(start: GaussianStart) -> Directions:
     far = _tail(_FAR / np.sqrt(1 + distortion) * (1 - 1e-12))
     square = d * _FAR**2
     return Directions(
-        mean=np.asarray(start.mean, dtype=float), gains=gains, slack=_FAR * np.sqrt(variance) * _UP + rounding,
+        mean=np.asarray(start.mean, dtype=float), gains=gains, rows=rows,
+        slack=_FAR * np.sqrt(variance) * _UP + rounding,
         missed=2 * far * (d + int(np.count_nonzero(variance))) * _UP,
         under=(1 + distortion) ** (-d / 2) * np.exp(-distortion * square / (2 * (1 - distortion))) / _UP,
         over=(1 - distortion) ** (-d / 2) * np.exp(distortion * square / (2 * (1 + distortion))) * _UP,
@@ -129,7 +131,7 @@ class StartMean:
         self.directions = directions_of(start)
         count = self.directions.gains.shape[1]
         self.dimensions = count
-        self.edges, self.least, self.most = _weights(_CELLS.get(count, 2))
+        self.edges, self.least, self.most = _weights(CELLS.get(count, 2))
         lines = np.meshgrid(*[self.edges] * count, indexing="ij")
         z = np.array([line.ravel() for line in lines]).reshape(count, -1)
         self.shape = (len(self.edges),) * count

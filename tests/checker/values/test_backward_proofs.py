@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import pickle
@@ -18,9 +19,11 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.report import unlimited
 from certbound.checker.statement import read_model
-from certbound.checker.values.kolmogorov import patch_residual
-from certbound.checker.values.kolmogorov.patch_residual import Solution
+from certbound.checker.values.kolmogorov import patch_residual, solution
+from certbound.checker.values.kolmogorov.cell_operator import Grid, Operator
 from certbound.checker.values.kolmogorov.patches import DEGREE, ROUNDED, Splines, to_powers
+from certbound.checker.values.kolmogorov.solution import Solution
+from certbound.checker.values.kolmogorov.stage import Stage
 from certbound.errors import CertificateError
 from certbound.problem.model import Tape, compile_numpy
 from certbound.safety.answers import EngineAnswer, exact
@@ -29,15 +32,22 @@ from certbound.safety.certificates import backward_proof, backward_proof_below, 
 from certbound.values.kolmogorov import Bounds
 from tests.checker.backward_forgeries import changed
 from tests.checker.conftest import (
+    arriving,
     backward_answer,
     backward_certificate,
+    gated,
+    loud_gated,
     loud_pendulum,
     loud_toggle,
     pendulum,
     predator,
+    pushed,
+    scattered,
     side_of,
     toggle,
 )
+
+FINE = {"cell": 0.12, "steps": 12}
 
 
 def sheared() -> cb.Problem:
@@ -58,8 +68,18 @@ def space() -> cb.Problem:
     return cb.Problem(system, initial=[0, 0, 0], safe=[cb.Inside(cb.Box([-1] * 3, [1] * 3))], horizon=1.0)
 
 
-def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator, size: float = 1.0) -> Solution:
-    """A proof whose v is anything on uneven nodes."""
+def driven() -> cb.Problem:
+    """Two states, time that swings and jumps, a drift that jumps, and a disturbance that is squared too."""
+    system = cb.ContinuousSystem(
+        lambda t, x, y, d: [np.where(t < 0.4, x, -y) + np.sin(3 * t) * y + d * x + d**2, np.where(x < 0.1, 0.3, -0.2)],
+        states=["x", "y"], diffusion=lambda t, x: [[0.3 + 0.1 * np.cos(2 * t), 0.0], [0.1 * x[0], 0.2]],
+        disturbance=cb.Box([-0.3], [0.3]),
+    )  # fmt: skip
+    return cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1.0)
+
+
+def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator, size: float = 1.0) -> Stage:
+    """A stage whose v is anything on uneven nodes."""
     n = problem.system.dimension
     axes = tuple(np.sort(np.concatenate([[-0.9, 0.9], rng.uniform(-0.9, 0.9, cells - 1)])) for _ in range(n))
     times = np.sort(np.concatenate([[0.0, 1.0], rng.uniform(0, 1, slabs - 1)]))
@@ -68,9 +88,9 @@ def rough(problem: cb.Problem, cells: int, slabs: int, rng: np.random.Generator,
     made = Splines(axes=axes, times=times, values=rows[0], rates=rows[1], budget=unlimited())
     proof = {"engine": "backward", "axes": exact([list(a) for a in axes]), "times": exact(times),
              "units": exact([1.0, 1.0]), "values": "", "rates": "", "eta": exact([1e9] * slabs)}  # fmt: skip
-    with patch.object(patch_residual, "read_splines", lambda *_: made):
+    with patch.object(solution, "read_splines", lambda *_: made):
         model = read_model(json.loads(json.dumps(problem_data(problem))), unlimited())
-        return Solution(model, proof, unlimited(), upper=True)
+        return Solution(model, proof, unlimited(), upper=True).stages[0]
 
 
 def value(splines: Splines, t: float, x: np.ndarray, orders: tuple[int, ...], rate: bool = False) -> float:
@@ -92,11 +112,11 @@ def value(splines: Splines, t: float, x: np.ndarray, orders: tuple[int, ...], ra
     return float(table)
 
 
-def generator(problem: cb.Problem, splines: Splines, t: float, x: np.ndarray) -> float:
+def generator(problem: cb.Problem, splines: Splines, t: float, x: np.ndarray, d: tuple[float, ...] = ()) -> float:
     """v_t + L v."""
     given, n = problem.system.diffusion, len(x)
-    flow = compile_numpy(problem.closed_loop)(0.0, *x).ravel()
-    g = compile_numpy(given)(0.0, *x).reshape(n, -1) if isinstance(given, Tape) else np.asarray(given)
+    flow = compile_numpy(problem.closed_loop)(t, *x, *d).ravel()
+    g = compile_numpy(given)(t, *x).reshape(n, -1) if isinstance(given, Tape) else np.asarray(given)
     a = g @ g.T
     total = value(splines, t, x, (0,) * n, rate=True)
     for i in range(n):
@@ -106,15 +126,16 @@ def generator(problem: cb.Problem, splines: Splines, t: float, x: np.ndarray) ->
     return total
 
 
-@pytest.mark.parametrize(("build", "cells"), [(sheared, 4), (space, 2)])
+@pytest.mark.parametrize(("build", "cells"), [(sheared, 4), (space, 2), (driven, 3)])
 @pytest.mark.parametrize("level", [0, 1])
 def test_the_residual_lies_below_its_bound_everywhere_on_a_patch(build, cells: int, level: int) -> None:
     problem, rng = build(), np.random.default_rng(level)
-    solution = rough(problem, cells, 2, rng)
-    splines, n = solution.splines, problem.system.dimension
+    stage = rough(problem, cells, 2, rng)
+    splines, n = stage.splines, problem.system.dimension
     shape = (*(count * 2**level for count in splines.cells), splines.slabs)
     *places, slab = np.unravel_index(np.arange(np.prod(shape)), shape)
-    need = solution._needs(slab, places, level)
+    need = stage.residual._needs(slab, places, level)
+    disturbed = problem.system.disturbance is not None
     for number in rng.choice(len(slab), 8, replace=False):
         k, seen = slab[number], -np.inf
         ends = [np.interp(np.array([p, p + 1]) / 2**level, np.arange(len(axis)), axis)
@@ -122,19 +143,20 @@ def test_the_residual_lies_below_its_bound_everywhere_on_a_patch(build, cells: i
         for share in rng.random((25, n + 1)):
             t = splines.times[k] + share[0] * (splines.times[k + 1] - splines.times[k])
             x = np.array([low + s * (high - low) for (low, high), s in zip(ends, share[1:])])
-            seen = max(seen, generator(problem, splines, t, x))
+            d = (float(rng.choice([-0.3, 0.3, rng.uniform(-0.3, 0.3)])),) if disturbed else ()
+            seen = max(seen, generator(problem, splines, t, x, d))
         size = abs(need[number]) + 1
         assert seen <= need[number] + 1e-9 * size
 
 
 def test_a_bound_is_close_where_patches_are_small() -> None:
     problem, rng = sheared(), np.random.default_rng(5)
-    solution = rough(problem, 3, 1, rng)
+    stage = rough(problem, 3, 1, rng)
     found = []
     for level in range(4):
-        shape = tuple(count * 2**level for count in solution.splines.cells)
+        shape = tuple(count * 2**level for count in stage.splines.cells)
         places = np.unravel_index(np.arange(np.prod(shape)), shape)
-        found.append(solution._needs(0 * places[0], places, level).max())
+        found.append(stage.residual._needs(0 * places[0], places, level).max())
     assert np.all(np.diff(found) <= 1e-9 * found[0])
     assert found[-2] - found[-1] < 0.05 * (found[0] - found[-1]) + 1e-9 * found[0]
 
@@ -142,25 +164,72 @@ def test_a_bound_is_close_where_patches_are_small() -> None:
 @pytest.mark.parametrize(("build", "cells"), [(sheared, 3), (space, 1)])
 def test_on_a_small_part_of_a_cell_the_bound_is_the_residual_itself(build, cells: int) -> None:
     problem, rng = build(), np.random.default_rng(3)
-    solution = rough(problem, cells, 1, rng)
-    splines, n = solution.splines, problem.system.dimension
+    stage = rough(problem, cells, 1, rng)
+    splines, n = stage.splines, problem.system.dimension
     splines.values[1], splines.rates[:] = splines.values[0], 0.0
     chosen = rng.integers(0, 2**7 * cells, size=(n, 40))
-    need = solution._needs(np.zeros(40, dtype=int), list(chosen), 7)
+    need = stage.residual._needs(np.zeros(40, dtype=int), list(chosen), 7)
     middle = [np.interp((place + 0.5) / 2**7, np.arange(len(a)), a) for a, place in zip(splines.axes, chosen)]
     seen = np.array([generator(problem, splines, 0.5, x) for x in np.array(middle).T])
     assert np.sum(seen > 0) > 10
     np.testing.assert_allclose(need, np.maximum(seen, 0), rtol=0, atol=0.06 * np.abs(seen).max())
 
 
+def test_from_below_one_disturbance_serves_each_patch() -> None:
+    swung = driven()
+    smooth = cb.ContinuousSystem(
+        lambda t, x, y, d: [np.sin(3 * t) * y + d * x, d - y], states=["x", "y"], diffusion=0.3 * np.eye(2),
+        disturbance=cb.Box([-0.3], [0.3]),
+    )  # fmt: skip
+    stage = rough(swung.replace(system=smooth), 3, 2, np.random.default_rng(4))
+    *places, slab = np.unravel_index(np.arange(18), (3, 3, 2))
+    alone = []
+    for acting in ((-0.3,), (0.3,)):
+        stage.residual.actings = (acting,)
+        alone.append(stage.residual._needs(slab, places, 0))
+    stage.residual.stated[:] = -1.0
+    stage.residual.actings = ((-0.3,), (0.3,))
+    assert np.any(alone[0] < alone[1])
+    assert np.any(alone[1] < alone[0])
+    np.testing.assert_array_equal(stage.residual._needs(slab, places, 0), np.minimum(*alone))
+
+
+def test_from_below_nothing_is_known_of_a_drift_that_jumps_under_disturbances() -> None:
+    stage = rough(driven(), 3, 1, np.random.default_rng(4))
+    places = np.unravel_index(np.arange(9), (3, 3))
+    assert np.isfinite(stage.residual._needs(0 * places[0], places, 0)).all()
+    stage.residual.actings = ((0.3,),)
+    need = stage.residual._needs(0 * places[0], places, 0)
+    jumps = (stage.splines.axes[0][:-1] < 0.1) & (stage.splines.axes[0][1:] > 0.1)
+    assert np.isinf(need[jumps[places[0]]]).all()
+    assert np.isfinite(need[~jumps[places[0]]]).all()
+
+
+def test_beside_a_jump_or_a_bend_in_time_the_model_is_smooth() -> None:
+    system = cb.ContinuousSystem(
+        lambda t, x, y: [np.where(t < 0.5, 0.3, 0.1) * x, np.abs(np.sin(4 * t - 2)) * y], states=["x", "y"],
+        diffusion=np.eye(2),
+    )
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=1.0)
+    operator = Operator(read_model(json.loads(json.dumps(problem_data(problem))), unlimited()), unlimited())
+    about = 1e-11
+    grid = Grid(axes=(np.array([0.0, 1.0]),) * 2, times=np.array([0.4, 0.5 - about, 0.5 + about, 0.6]))
+    places = (np.zeros(3, dtype=int),) * 2
+    models = operator.models(grid, np.arange(3), places, 0, None)
+    errors = np.array([model.error for orders, _, model in models if sum(orders) == 1])
+    assert np.all(errors[:, [0, 2]] < 1e-4)
+    assert 0.05 < errors[0, 1] < 0.5
+    assert errors[1, 1] < 1e-9
+
+
 def test_parts_of_patches_cover_them_where_the_file_states_too_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    solution = rough(sheared(), 3, 2, np.random.default_rng(9))
+    stage = rough(sheared(), 3, 2, np.random.default_rng(9))
     monkeypatch.setattr(patch_residual, "_DEEPEST", 1)
-    solution.stated[:] = -1.0
-    shape = (*(2 * count for count in solution.splines.cells), 2)
+    stage.residual.stated[:] = -1.0
+    shape = (*(2 * count for count in stage.splines.cells), 2)
     *places, slab = np.unravel_index(np.arange(np.prod(shape)), shape)
-    need = solution._needs(slab, places, 1)
-    assert solution._payments() == pytest.approx([need[slab == k].max() for k in (0, 1)])
+    need = stage.residual._needs(slab, places, 1)
+    assert stage.residual.payments() == pytest.approx([need[slab == k].max() for k in (0, 1)])
 
 
 def blossom(knots: list[Fraction], coefficients: list[Fraction], arguments: list[Fraction]) -> Fraction:
@@ -223,8 +292,8 @@ def test_v_on_a_face_is_that_of_its_outermost_coefficients() -> None:
 def test_v_lies_above_its_lower_bound_and_below_its_upper_one_at_starts(level: int) -> None:
     problem, rng = space(), np.random.default_rng(level)
     splines = rough(problem, 2, 1, rng).splines
-    solution = rough(problem, 2, 1, rng)
-    splines = solution.splines
+    stage = rough(problem, 2, 1, rng)
+    splines = stage.splines
     shape = tuple(count * 2**level for count in splines.cells)
     places = np.unravel_index(np.arange(np.prod(shape)), shape)
     least = splines.patches(0 * places[0], places, level).lowest()
@@ -235,28 +304,35 @@ def test_v_lies_above_its_lower_bound_and_below_its_upper_one_at_starts(level: i
             x = np.array([low + s * (high - low) for (low, high), s in zip(ends, share[1:])])
             assert value(splines, share[0], x, (0, 0, 0)) >= least[number] - 1e-9
     low, high = np.array([-0.5, -0.3, 0.1]), np.array([0.2, -0.3, 0.8])
-    most = solution._most_over([(arb(a), arb(b)) for a, b in zip(low.tolist(), high.tolist())])
+    most = stage.most_over([(arb(a), arb(b)) for a, b in zip(low.tolist(), high.tolist())])
     seen = max(value(splines, 0.0, low + s * (high - low), (0, 0, 0)) for s in rng.random((300, 3)))
     assert seen <= most
     point = [(arb(a), arb(a)) for a in low.tolist()]
-    assert solution._most_over(point) == pytest.approx(value(splines, 0.0, low, (0, 0, 0)), abs=1e-7)
+    assert stage.most_over(point) == pytest.approx(value(splines, 0.0, low, (0, 0, 0)), abs=1e-7)
 
 
 # ---- whole files ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("build", [toggle, pendulum, predator])
-def test_certificates_from_above_are_proved_and_say_about_what_the_engine_says(build) -> None:
-    problem, answer = backward_answer(build, lower=False)
-    report = check_data(parse(backward_certificate(build)), json.loads(json.dumps(problem_data(problem))))
+@pytest.mark.parametrize(
+    ("build", "grid"),
+    [(toggle, {}), (pendulum, {}), (predator, {}), (gated, {"cell": 0.2, "steps": 8}), (arriving, FINE),
+     (pushed, {"steps": 8}), (scattered, FINE)],
+)  # fmt: skip
+def test_certificates_from_above_are_proved_and_say_about_what_the_engine_says(build, grid) -> None:
+    problem, answer = backward_answer(build, lower=False, **grid)
+    report = check_data(parse(backward_certificate(build, **grid)), json.loads(json.dumps(problem_data(problem))))
     assert report.valid, report.reason
     assert "a solution of the backward equation" in report.reason
-    assert 10**report.log10_proved == pytest.approx(answer.details.upper, rel=0.01)
+    assert 0.94 * answer.details.upper <= 10**report.log10_proved <= 1.01 * answer.details.upper
 
 
 @pytest.mark.parametrize(
-    ("build", "grid"), [(loud_toggle, {"steps": 16}), (loud_pendulum, {"cell": 0.12, "steps": 16})]
-)
+    ("build", "grid"),
+    [(loud_toggle, {"steps": 16}), (loud_pendulum, {"cell": 0.12, "steps": 16}),
+     (loud_gated, {"cell": 0.2, "steps": 8}), (arriving, FINE), (pushed, {"cell": 0.1, "steps": 14}),
+     (scattered, FINE)],
+)  # fmt: skip
 def test_certificates_from_below_are_proved_and_say_about_what_the_engine_says(build, grid) -> None:
     problem, answer = backward_answer(build, lower=True, **grid)
     data = parse(backward_certificate(build, lower=True, **grid))
@@ -265,12 +341,16 @@ def test_certificates_from_below_are_proved_and_say_about_what_the_engine_says(b
     assert 10**report.log10_lower_proved >= 0.99 * answer.details.lower
 
 
-def test_a_limit_over_the_whole_horizon_is_one_for_all_times_and_another_window_is_not_treated() -> None:
+def test_from_above_a_limit_may_hold_for_less_time_than_the_proof_says_and_from_below_not() -> None:
     data = parse(backward_certificate(toggle))
-    data["problem"]["constraints"][0]["during"] = exact([0.0, 1.0])
+    for window in ([0.0, 1.0], [0.0, 0.9]):
+        data["problem"]["constraints"][0]["during"] = exact(window)
+        assert check_data(data).valid
+    data = parse(backward_certificate(loud_toggle, lower=True, steps=16))
+    data["problem"]["constraints"][0]["during"] = exact([0.0, 2.0])
     assert check_data(data).valid
-    data["problem"]["constraints"][0]["during"] = exact([0.0, 0.9])
-    assert "time window" in check_data(data).reason
+    data["problem"]["constraints"][0]["during"] = exact([0.0, 1.9])
+    assert not check_data(data).valid
 
 
 def test_smaller_rooms_take_more_digits_and_change_the_bound_less() -> None:
@@ -279,7 +359,7 @@ def test_smaller_rooms_take_more_digits_and_change_the_bound_less() -> None:
     wide, narrow = witness.rounded(0.02), witness.rounded(1e-6)
     assert wide.bound <= witness.bound + 0.02
     assert narrow.bound <= witness.bound + 1e-6
-    assert wide.units[0] > narrow.units[0]
+    assert wide.stages[0].units[0] > narrow.stages[0].units[0]
 
 
 def test_what_is_kept_does_not_change_with_later_passes() -> None:
@@ -296,20 +376,50 @@ def refused(problem: cb.Problem, answer: EngineAnswer, lower: bool = False) -> s
     return str(caught.value)
 
 
-def test_the_writer_says_what_no_certificate_states_yet() -> None:
+def test_the_writer_says_where_it_has_no_function() -> None:
     problem, answer = backward_answer(toggle, lower=False)
-    system = problem.system
-    pushed = cb.ContinuousSystem(
-        lambda x, d: [d[0] - x[0], -x[1]], states=2, disturbance=cb.Box([-0.1], [0.1]), diffusion=np.eye(2)
-    )
-    timed = cb.ContinuousSystem(lambda t, x: [t - x[0], -x[1]], states=2, diffusion=np.eye(2))
-    plain = problem.replace(initial=[0.6, 0.6])
-    assert "disturbance" in refused(plain.replace(system=pushed), answer)
-    assert "changes with time" in refused(plain.replace(system=timed), answer)
-    assert "random starts" in refused(plain.replace(initial=cb.GaussianStart([1, 1], 0.01 * np.eye(2))), answer)
+    still = problem.replace(initial=cb.GaussianStart([1, 1], np.zeros((2, 2))))
+    assert "does not vary" in refused(still, answer)
     assert "kept no function" in refused(problem, EngineAnswer(details=None))
     assert "kept no function" in refused(problem, answer, lower=True)
-    assert system is problem.system
+
+
+def solution_of(text: str, lower: bool = False) -> Solution:
+    """The proof of a certificate."""
+    data = parse(text)
+    return Solution(read_model(data["problem"], unlimited()), data["proof"], unlimited(), upper=not lower)
+
+
+@pytest.mark.parametrize("lower", [False, True])
+def test_what_a_stage_lacks_at_its_end_is_the_most_that_the_next_one_asks_for(lower: bool) -> None:
+    proof = solution_of(backward_certificate(loud_gated if lower else gated, lower=lower, cell=0.2, steps=8), lower)
+    first, second = proof.stages
+    rng, size = np.random.default_rng(3), 0.6 if lower else 0.7
+    first.splines.values[-1] += 0.05 * rng.normal(size=first.splines.values[-1].shape)
+    lacks, seen = first._at_end(second), -np.inf
+    for x in rng.uniform(-1.5, 1.5, size=(1000, 2)):
+        own, after = value(first.splines, 0.5, x, (0, 0)), value(second.splines, 0.5, x, (0, 0))
+        wanted = (-1.0 if lower else 1.0) if np.abs(x).max() > size else min(0.0 if lower else 1.0, after)
+        seen = max(seen, wanted - own)
+    assert 0.3 * lacks < seen <= lacks + 1e-12
+
+
+@pytest.mark.parametrize("lower", [False, True])
+def test_the_mean_over_a_normal_start_is_bounded_closely(lower: bool) -> None:
+    proof = solution_of(backward_certificate(scattered, lower=lower, **FINE), lower)
+    (stage,), start = proof.stages, scattered().initial
+    z, weights = np.polynomial.hermite_e.hermegauss(40)
+    factor, mean = np.linalg.cholesky(start.covariance), 0.0
+    for (a, p), (b, q) in itertools.product(zip(z, weights / weights.sum()), repeat=2):
+        x = start.mean + factor @ [a, b]
+        inside = np.abs(x).max() < 1
+        seen = value(stage.splines, 0.0, x, (0, 0)) * (-1.0 if lower else 1.0) if inside else 1.0
+        mean += p * q * min(max(seen, 0.0), 1.0)
+    bound = proof.start.bound(stage)
+    if lower:
+        assert 0.8 * mean - 1e-3 <= -bound <= mean + 1e-4
+    else:
+        assert mean - 1e-3 <= bound <= 1.05 * mean
 
 
 def test_arrays_of_more_than_the_limit_are_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
