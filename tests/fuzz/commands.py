@@ -30,6 +30,8 @@ BUDGETS = {
     "simulate": 20.0, "file": 5.0, "cli": 30.0,
 }  # fmt: skip
 """Seconds of processor time that an answer may take; a slower one is a finding."""
+PATIENCE = 10.0
+"""Limit of time that verify is given, seconds: without one, every engine that applies is asked in full."""
 PATHS = 10_000
 FINER = (4, 16, 64, 256)
 """Refinements of the time step that must confirm a contradiction in continuous time."""
@@ -99,7 +101,7 @@ class Run:
 
     def verify(self) -> None:
         """A verdict, whatever the problem."""
-        self.verdict = self._attempt("verify", lambda: cb.verify_safety(self.problem))
+        self.verdict = self._attempt("verify", lambda: cb.verify_safety(self.problem, time_limit=PATIENCE))
         if self.verdict is None:
             return
         verdict = self.verdict
@@ -124,7 +126,9 @@ class Run:
         if self.verdict is None:
             return
         units = self.draft.units.times(factor, time_factor)
-        found = self._attempt("units", lambda: cb.verify_safety(self.draft.problem(units)), documented="verify")
+        found = self._attempt(
+            "units", lambda: cb.verify_safety(self.draft.problem(units), time_limit=PATIENCE), documented="verify"
+        )
         if found is None:
             return
         first, second = self.verdict, found
