@@ -29,7 +29,12 @@ from certbound.values.kolmogorov.equation import (
 )
 from certbound.values.kolmogorov.face_exits import ALWAYS, Face, face_of, shortfall
 from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
-from certbound.values.kolmogorov.slab_residual import Generator, residual_bound, rough_residual
+from certbound.values.kolmogorov.slab_residual import (
+    Generator,
+    most_at_knots,
+    residual_bound,
+    rough_residual,
+)
 from certbound.values.kolmogorov.splines import (
     DEGREE,
     Axis,
@@ -41,7 +46,7 @@ from certbound.values.kolmogorov.splines import (
 )
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
-_FIRST, _GROWTH = 12, 1.15  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
+_FIRST, _GROWTH = 12, 1.3  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
 _AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
 _OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
 _MARGIN = 0.1  # by which a source exceeds what it pays for
@@ -605,11 +610,18 @@ class Side:
         """A bound of v_t + L v on every cell, slab by slab from the end backward; ``rough`` about that, and quicker."""
         lattice = int(np.prod([axis.sampling.parts for axis in (self.sketch if rough else self.generator).axes]))
         many = max(1, _BATCH * len(self.steps) // (lattice * self.own_work))
+        knots: Array | None = None
         with ThreadPoolExecutor(2) as pool:
-            parts = pool.map(lambda k: self._bounded(rough, k, k + many), range(0, len(self.steps), many))
+            if not rough and all(one is None for one in self.factors):
+                groups = [slice(k, k + many) for k in range(0, len(self.values), many)]
+                knots = np.concatenate(list(pool.map(self._at_knots, groups)))
+            parts = pool.map(lambda k: self._bounded(rough, k, k + many, knots), range(0, len(self.steps), many))
             return [bound for part in parts for bound in part]
 
-    def _bounded(self, rough: bool, begin: int, end: int) -> list[Array]:
+    def _at_knots(self, some: slice[int, int, int]) -> Array:
+        return most_at_knots(self.generator, np.array(self.values[some]), np.array(self.rates[some]))
+
+    def _bounded(self, rough: bool, begin: int, end: int, knots: Array | None = None) -> list[Array]:
         steps = self.steps[begin:end]
         values, rates = (np.array(rows[begin : begin + len(steps) + 1]) for rows in (self.values, self.rates))
         factors = [None if one is None else one.on(slice(begin, end)) for one in self.factors]
@@ -617,7 +629,10 @@ class Side:
         if rough:
             bound = rough_residual(self.sketch, values, rates, steps, factors, worst=self.above)
         else:
-            bound = residual_bound(self.generator, values, rates, steps, factors, worst=self.above, clock=clock)
+            bound = residual_bound(
+                self.generator, self.sketch, values, rates, steps, factors, worst=self.above, clock=clock,
+                knots=None if knots is None else knots[begin : begin + len(steps) + 1],
+            )  # fmt: skip
         done = self._decided(values, rates, steps) | self.arrived
         return list(np.where(done, 0.0, np.maximum(bound, 0.0)))
 

@@ -147,8 +147,9 @@ class Search:
             begun, self.runs = self.work, self.runs + 1
             for above in self.sides:
                 side = self._side(above)
-                if not self.work and len(self.sides) * _USUAL * side.work > budget:
-                    yield self._bounds(side, proved=False)
+                if self.runs == 1 and self.work - begun + _USUAL * side.work > budget:  # an upper bound at least
+                    self.cost = self.work - begun
+                    yield self._bounds(side, proved=self.work > 0)
                     return
                 for stage in side.stages[::-1]:
                     stage.propose()

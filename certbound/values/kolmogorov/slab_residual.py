@@ -3,14 +3,21 @@
 v is a quintic tensor spline in space and a cubic in time, by its coefficients U_k and their time derivatives D_k at
 the knots t_k. On a slab of length h it has the Bernstein coefficients (in time)
 
-    b_0 = U_k,  b_1 = U_k + h D_k / 3,  b_2 = U_{k+1} - h D_{k+1} / 3,  b_3 = U_{k+1},
+    b_0 = U_k,  b_1 = U_k + h D_k / 3,  b_2 = U_{k+1} - h D_{k+1} / 3,  b_3 = U_{k+1}.
 
-and v_t those of 3 (b_{j+1} - b_j) / h, raised by one degree. For coefficients that do not depend on time the residual
-r = v_t + L v is a cubic in time with coefficients r_j(x) = (v_t)_j + L b_j, and r <= max_j r_j.
+With the mean rate S = (U_{k+1} - U_k) / h it is the line from U_k to U_{k+1} and a *bulge*, whose inner coefficients
+are h (D_k - S) / 3 and h (S - D_{k+1}) / 3; and v_t is the line from D_k to D_{k+1} and a bulge with
+2 S - D_k - D_{k+1} for both. For coefficients that do not depend on time the residual r = v_t + L v is accordingly the
+line between the values D_k + L U_k at the knots, and a bulge of degree 3 with inner coefficients made of these, so that
 
-On a cell let p be the tensor interpolant of r_j at the cell's lattice points, of degree m along each axis, with the
-Lebesgue constant C, the tail's constant c and gaps g of `splines.Sampling`, and h_i the cell's widths. With drift and
-noise replaced by their own interpolants (`cell_fields`), whose errors are paid by the size of v's derivatives,
+    r <= max(D_k + L U_k, D_{k+1} + L U_{k+1}) + max(0, both coefficients of the bulge).
+
+What is at a knot serves two slabs. The bulge is small where steps are, and is looked at on fewer points.
+
+On a cell let p be the tensor interpolant of one of these functions, r_j, at the cell's lattice points, of degree m
+along each axis, with the Lebesgue constant C, the tail's constant c and gaps g of `splines.Sampling`, and h_i the
+cell's widths. With drift and noise replaced by their own interpolants (`cell_fields`), whose errors are paid by the
+size of v's derivatives,
 
     r_j <= max p(lattice) + g^2 / 8 sum_i max (-h_i^2 d_ii p)^+                    (chords, `most_of_interpolants`)
            + sum_i C^i c h_i^(m+1) sup |d_i^(m+1) r_j|                                     (the interpolation's error),
@@ -18,9 +25,10 @@ noise replaced by their own interpolants (`cell_fields`), whose errors are paid 
 and d_i^(m+1) r_j is bounded term by term: d^(m+1) (F D) = sum_k binomial(m + 1, k) d^k F d^(m+1-k) D, d^(m+1) F = 0.
 
 Where L = sum_g c_g(t, d) L_g (`products`), each c_g is a polynomial of degree q in the share of the slab, but for an
-error (`factors`). Then r has degree 3 + q, with coefficients
+error (`factors`). Then both parts are products of polynomials, of degrees 1 + q and 3 + q: with the coefficients x_j of
+one of the parts of v, of degree p,
 
-    r_k = (v_t)_k + sum_g sum_{i+j=k} binomial(q, i) binomial(3, j) / binomial(3 + q, k) c_gi L_g b_j,
+    sum_g sum_{i+j=k} binomial(q, i) binomial(p, j) / binomial(p + q, k) c_gi L_g x_j,
 
 means of products, so that the same bounds of sizes serve; the errors of c_g are paid by the size of L_g v.
 """
@@ -79,15 +87,21 @@ class Generator:
                         terms.append((plus(unit(i, n), unit(j, n)), field, 0.5 if i == j else 1.0, g))
         return cls(axes=axes, terms=tuple(terms), products=len(products))
 
+    def at_lattice(self, coefficients: Array) -> Array:
+        """v at the lattice points."""
+        for k in reversed(range(len(self.axes))):
+            coefficients = self.axes[k].on_lattice[0].along(coefficients, k + 1)
+        return coefficients
+
     def on_lattice(self, coefficients: Array) -> tuple[Array, list[Array]]:
         """v and every L_g v at the lattice points."""
         n = len(self.axes)
         parts: dict[tuple[int, ...], Array] = {(): coefficients}
         wanted = {orders for orders, *_ in self.terms} | {(0,) * n}
-        for axis in range(n):
+        for axis in reversed(range(n)):  # most points are made along the first axis, where memory is contiguous behind
             new: dict[tuple[int, ...], Array] = {}
-            for orders in {one[: axis + 1] for one in wanted}:
-                new[orders] = self.axes[axis].on_lattice[orders[-1]].along(parts[orders[:-1]], axis + 1)
+            for orders in {one[axis:] for one in wanted}:
+                new[orders] = self.axes[axis].on_lattice[orders[0]].along(parts[orders[1:]], axis + 1)
             parts = new
         totals = [np.zeros_like(parts[(0,) * n]) for _ in range(self.products)]
         for orders, field, weight, g in self.terms:
@@ -121,10 +135,10 @@ class Generator:
             scale *= axis.sampling.lebesgue
         return np.asarray(total)
 
-    def roundoff(self, sizes: Sizes, rates: Sizes, step: Array, large: Sequence[Array | float]) -> Array:
-        """Per cell: what the rounding of r_j at its lattice points may come to."""
+    def roundoff(self, sizes: Sizes, rates: Sizes, speed: Array, large: Sequence[Array | float]) -> Array:
+        """Per cell: what the rounding of r_j at its lattice points may come to; rates have up to ``speed`` times v."""
         zero = (0,) * len(self.axes)
-        total = rates(zero) + 8 / step * sizes(zero)
+        total = rates(zero) + speed * sizes(zero)
         for orders, field, weight, g in self.terms:
             factors = [axis.condition[order] for axis, order in zip(self.axes, orders)]
             total = total + weight * large[g] * field.slopes[0][0] * outer(factors) * sizes(zero)
@@ -153,13 +167,16 @@ class Sizes:
 
 
 def residual_bound(
-    generator: Generator, values: Array, rates: Array, steps: Array, factors: Sequence[Factor | None] = (None,),
-    *, worst: bool = True, clock: Array | None = None,
+    generator: Generator, sketch: Generator, values: Array, rates: Array, steps: Array,
+    factors: Sequence[Factor | None] = (None,), *, worst: bool = True, clock: Array | None = None,
+    knots: Array | None = None,
 ) -> Array:  # fmt: skip
     """A bound of v_t + L v from above on every cell of every slab.
 
     Parameters
     ----------
+    generator, sketch : Generator
+        On the same axes; the second with fewer points on a cell, for the bulges.
     values, rates : ndarray, shape (K + 1, N_1 + 5, ...)
         Coefficients of v and v_t at the knots, from the last one backward.
     steps : ndarray, shape (K,)
@@ -170,24 +187,34 @@ def residual_bound(
         Whether the bound is one for all disturbances, or for the best of their nodes on each cell and slab.
     clock : ndarray, shape (K,), optional
         Share of each slab by which its length is off.
+    knots : ndarray, shape (K + 1, N_1, ...), optional
+        What `most_at_knots` proves, where it is known already.
 
     Returns
     -------
     ndarray, shape (K, N_1, ...)
     """
-    axes = generator.axes
-    n = len(axes)
+    n = len(generator.axes)
     h = steps.reshape(-1, *[1] * n)
-    moved = _in_time(generator, values, rates, h, factors)
-    bounds = [np.maximum.reduce([most_of_interpolants(axes, r) for r in one]) for one in moved]
-    bound = np.maximum.reduce(bounds) if worst else np.minimum.reduce(bounds)
-    sizes, speeds = _sizes(axes, values, rates, h)
+    v, d = Derivatives(generator.axes, values), Derivatives(generator.axes, rates)
+    whole, speeds = _sizes(v, d, values, h)
     large = [1.0 if one is None else one.size.reshape(h.shape) for one in factors]
     off = [np.zeros(()) if one is None else (one.spread + worst * one.between).reshape(h.shape) for one in factors]
-    extra = generator.remainder(sizes, speeds, large, off) + generator.roundoff(sizes, speeds, h, large)
+    if all(one is None for one in factors):
+        bound = _between_knots(most_at_knots(generator, values, rates) if knots is None else knots)
+    else:
+        ends, paces = (Sizes([[(one, _EARLY, 1.0)], [(one, _LATE, 1.0)]]) for one in (v, d))
+        extra = generator.remainder(ends, paces, large, off) + generator.roundoff(whole, speeds, 8 / h, large)
+        bound = _lines(generator, values, rates, factors, worst) + extra * _UP
+    bulge, middle = _bulges(values, rates, h)
+    parts = [Derivatives(generator.axes, one) for one in (*bulge, middle)]
+    bends, turns = Sizes([[(one, _EVERY, 1.0)] for one in parts[:2]]), Sizes([[(parts[2], _EVERY, 1.0)]])
+    more = _most(_products(sketch, bulge, middle, factors), sketch.axes, True)  # whichever disturbance is best
+    over = sketch.remainder(bends, turns, large, off) + sketch.roundoff(whole, speeds, 8 / h, large)
+    bound = bound + np.maximum(more, 0.0) + over * _UP
     if clock is not None:
-        extra = extra + clock.reshape(h.shape) * speeds((0,) * n)
-    return np.asarray(bound + extra * _UP)
+        bound = bound + clock.reshape(h.shape) * speeds((0,) * n) * _UP
+    return np.asarray(bound)
 
 
 def rough_residual(
@@ -195,40 +222,101 @@ def rough_residual(
     *, worst: bool = True,
 ) -> Array:  # fmt: skip
     """About the same, from values at lattice points alone: nothing is proved of it."""
-    moved = _in_time(generator, values, rates, steps.reshape(-1, *[1] * len(generator.axes)), factors)
-    bounds = [np.maximum.reduce([over_cells(generator.axes, r) for r in one]) for one in moved]
-    return np.asarray(np.maximum.reduce(bounds) if worst else np.minimum.reduce(bounds))
+    h = steps.reshape(-1, *[1] * len(generator.axes))
+    lines = _lines(generator, values, rates, factors, worst, proved=False)
+    bulge, middle = _bulges(values, rates, h)
+    more = _most(_products(generator, bulge, middle, factors), generator.axes, True, proved=False)
+    return np.asarray(lines + np.maximum(more, 0.0))
 
 
-def _in_time(
-    generator: Generator, values: Array, rates: Array, h: Array, factors: Sequence[Factor | None]
+_LATE, _EARLY, _EVERY = slice(None, -1), slice(1, None), slice(None)
+
+
+def most_at_knots(generator: Generator, values: Array, rates: Array, *, proved: bool = True) -> Array:
+    """A bound of v_t + L v from above on every cell at every knot, for coefficients that do not change.
+
+    Parameters
+    ----------
+    values, rates : ndarray, shape (K, N_1 + 5, ...)
+    proved : bool
+        Or about that: the largest of the values on the lattice.
+
+    Returns
+    -------
+    ndarray, shape (K, N_1, ...)
+    """
+    _, images = generator.on_lattice(values)
+    bound = _most([[generator.at_lattice(rates) + np.add.reduce(images)]], generator.axes, True, proved)
+    if not proved:
+        return bound
+    sizes, paces = (Sizes([[(Derivatives(generator.axes, one), _EVERY, 1.0)]]) for one in (values, rates))
+    ones, none = [1.0] * generator.products, [np.zeros(())] * generator.products
+    extra = generator.remainder(sizes, paces, ones, none) + generator.roundoff(sizes, paces, np.zeros(()), ones)
+    return np.asarray(bound + extra * _UP)
+
+
+def _between_knots(bounds: Array) -> Array:
+    return np.asarray(np.maximum(bounds[_EARLY], bounds[_LATE]))
+
+
+def _lines(
+    generator: Generator, values: Array, rates: Array, factors: Sequence[Factor | None], worst: bool,
+    proved: bool = True,
+) -> Array:  # fmt: skip
+    """The most of the interpolants of v_t + L v with what is linear between the knots, on every cell of every slab."""
+    if all(one is None for one in factors):
+        return _between_knots(most_at_knots(generator, values, rates, proved=proved))
+    _, images = generator.on_lattice(values)
+    pace = generator.at_lattice(rates)
+    shares = [[image[_EARLY], image[_LATE]] for image in images]
+    return _most(_combined([pace[_EARLY], pace[_LATE]], shares, factors), generator.axes, worst, proved)
+
+
+def _bulges(values: Array, rates: Array, h: Array) -> tuple[list[Array], Array]:
+    """Coefficients of the inner coefficients, in time, of the bulge of v, and of those of the bulge of v_t."""
+    mean = (values[_LATE] - values[_EARLY]) / h
+    early, late = rates[_EARLY] - mean, mean - rates[_LATE]
+    return [h / 3 * early, h / 3 * late], late - early
+
+
+def _products(
+    generator: Generator, bulge: list[Array], middle: Array, factors: Sequence[Factor | None]
 ) -> list[list[Array]]:  # fmt: skip
-    """The Bernstein coefficients in time of v_t + L v at the lattice points: for all disturbances, or for each node."""
-    n = len(generator.axes)
-    value, images = generator.on_lattice(values)
-    rate, images_of_rates = generator.on_lattice(rates)
-    late, early = slice(None, -1), slice(1, None)
-    degree = 3 + max((0 if one is None else one.degree for one in factors), default=0)
-    moved = [_raised(_speeds(value, rate, h), degree)]
-    for factor, image, of_rate in zip(factors, images, images_of_rates):
-        parts = (
-            image[early], image[early] + h / 3 * of_rate[early], image[late] - h / 3 * of_rate[late], image[late],
-        )  # fmt: skip
+    """Coefficients in time of the bulge of v_t + L v at lattice points: for all disturbances, or for each node."""
+    _, first = generator.on_lattice(bulge[0])
+    _, second = generator.on_lattice(bulge[1])
+    pace = generator.at_lattice(middle)
+    none = np.zeros_like(pace)
+    shares = [[none, one, other, none] for one, other in zip(first, second)]
+    if all(one is None for one in factors):
+        return [[pace + np.add.reduce(first), pace + np.add.reduce(second)]]
+    return _combined([none, pace, pace, none], shares, factors)
+
+
+def _combined(
+    pace: list[Array], images: list[list[Array]], factors: Sequence[Factor | None]
+) -> list[list[Array]]:  # fmt: skip
+    """Bernstein coefficients of v_t + sum_g c_g L_g v, from those of its parts."""
+    n = pace[0].ndim - 1
+    degree = len(pace) - 1 + max((0 if one is None else one.degree for one in factors), default=0)
+    moved = [_raised(pace, degree)]
+    for factor, image in zip(factors, images):
         if factor is None:
-            shares = [_raised(list(parts), degree)]
+            shares = [_raised(image, degree)]
         else:
             rows = factor.bernstein.reshape(*factor.bernstein.shape, *[1] * n)
-            shares = [_product([row[:, i] for i in range(factor.degree + 1)], parts, degree) for row in rows]
+            shares = [_product([row[:, i] for i in range(factor.degree + 1)], image, degree) for row in rows]
         if len(moved) < len(shares):
             moved = moved * len(shares)
         moved = [[a + b for a, b in zip(one, shares[v % len(shares)])] for v, one in enumerate(moved)]
     return moved
 
 
-def _speeds(value: Array, rate: Array, h: Array) -> list[Array]:
-    """Bernstein coefficients of v_t, of degree 2, from the early end of each slab to its late one."""
-    late, early = slice(None, -1), slice(1, None)
-    return [rate[early], 3 * (value[late] - value[early]) / h - (rate[early] + rate[late]), rate[late]]
+def _most(moved: list[list[Array]], axes: tuple[Axis, ...], worst: bool, proved: bool = True) -> Array:
+    """The most on every cell over coefficients in time, and over disturbances or for the best of them."""
+    most = most_of_interpolants if proved else over_cells
+    bounds = [np.maximum.reduce([most(axes, r) for r in one]) for one in moved]
+    return np.asarray(np.maximum.reduce(bounds) if worst else np.minimum.reduce(bounds))
 
 
 def _raised(parts: list[Array], degree: int) -> list[Array]:
@@ -252,14 +340,12 @@ def _product(first: Sequence[Array | float], second: Sequence[Array], degree: in
     return result
 
 
-def _sizes(axes: tuple[Axis, ...], values: Array, rates: Array, h: Array) -> tuple[Sizes, Sizes]:
+def _sizes(v: Derivatives, d: Derivatives, values: Array, h: Array) -> tuple[Sizes, Sizes]:
     """Bounds of the derivatives of the Bernstein coefficients of v, and of those of v_t.
 
-    The middle ones of v_t are (D_k + 2 m) / 3 with m = 3 (U_{k+1} - U_k) / h - D_k - D_{k+1}, and the same mirrored.
+    The middle one of v_t is 3 (U_{k+1} - U_k) / h - D_k - D_{k+1}.
     """
-    late, early, every = slice(None, -1), slice(1, None), slice(None)
-    v, d = Derivatives(axes, values), Derivatives(axes, rates)
-    change = Derivatives(axes, (values[late] - values[early]) * (2 / h))
-    sizes = Sizes([[(v, early, 1.0), (d, early, h / 3)], [(v, late, 1.0), (d, late, h / 3)]])
-    speeds = Sizes([[(d, early, 1.0)], [(d, late, 1.0)], [(change, every, 1.0), (d, early, 1.0), (d, late, 1.0)]])
+    change = Derivatives(v.axes, (values[_LATE] - values[_EARLY]) * (3 / h))
+    sizes = Sizes([[(v, _EARLY, 1.0), (d, _EARLY, h / 3)], [(v, _LATE, 1.0), (d, _LATE, h / 3)]])
+    speeds = Sizes([[(change, _EVERY, 1.0), (d, _EARLY, 1.0), (d, _LATE, 1.0)]])
     return sizes, speeds

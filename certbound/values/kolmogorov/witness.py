@@ -22,7 +22,7 @@ from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.start_law import CELLS, Directions, directions_of
 from certbound.watch import poll
 
-_SOLVER = ("mesh", "carrier", "maps", "carried_maps", "sketch", "policy")
+_SOLVER = ("mesh", "carrier", "maps", "carried_maps", "policy")
 _FINER = 2  # bits more, where rounded coefficients raise the bound by more than there is room for
 _BRIEF = 0.1  # of the room, over all slabs, that these may cost without a closer look
 _MOST_BITS = 42  # of a whole number: five differences of such have 15 digits at most

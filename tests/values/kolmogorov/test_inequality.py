@@ -116,20 +116,21 @@ def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("parts", PARTS)
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("steady", [False, True])
-def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(
-    name: str, parts: int, steady: bool
-) -> None:
+def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(name: str, parts: int, steady: bool) -> None:
     rng = np.random.default_rng(5)
     axes = (axis(rng, 7, parts), axis(rng, 8, parts))
     g = np.array([[0.5, 0.0], [0.2, 0.4]])
     a = g @ g.T
-    drift = fields_of(name).on(axes, Interval.point(0.0))
-    generator = Generator.of(axes, (drift, _constant_fields(axes, a)))
+    coarse = tuple(Axis(one.nodes, Sampling(2)) for one in axes)
+    generator, sketch = (
+        Generator.of(grid, (fields_of(name).on(grid, Interval.point(0.0)), _constant_fields(grid, a)))
+        for grid in (axes, coarse)
+    )
     values, rates = rng.normal(size=(3, 12, 13)), rng.normal(size=(3, 12, 13))
     if steady:  # the drift's and the noise's own terms alone, where v does not change
         values, rates = np.broadcast_to(values[:1], values.shape).copy(), np.zeros_like(rates)
     steps = np.array([0.3, 0.2])
-    bound = residual_bound(generator, values, rates, steps)
+    bound = residual_bound(generator, sketch, values, rates, steps)
     points, t = points_in(axes, rng), rng.uniform(0, 1, 4000)
     cells = cell_of(axes, points)
     f = [np.broadcast_to(row, t.shape) for row in MODELS[name](points[:, 0], points[:, 1])]
@@ -187,7 +188,7 @@ def test_a_hump_that_no_line_of_the_lattice_shows_is_bounded_in_three_states() -
     rows = [one.from_nodes() @ basis for one in axes]
     rate = np.einsum("ia,jb,kc,abc->ijk", *rows, lattice)
     values = np.stack([np.zeros_like(rate), -rate])
-    bound = residual_bound(Generator(axes=axes, terms=()), values, np.stack([rate, rate]), np.array([1.0]))
+    bound = residual_bound(*[Generator(axes=axes, terms=())] * 2, values, np.stack([rate, rate]), np.array([1.0]))
     inside = np.append(np.random.default_rng(8).uniform(0, 1, (2000, 3)), [[0.2, 0.2, 0.2]], axis=0)
     weights = [_lagrange(axes[0].sampling.nodes, inside[:, k]) for k in range(3)]
     seen = np.einsum("pa,pb,pc,abc->p", *weights, lattice)

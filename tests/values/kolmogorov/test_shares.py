@@ -17,9 +17,7 @@ from certbound.values.kolmogorov.splines import cells_of
 
 def near_one_limit() -> cb.Problem:
     """Noise leads paths through one limit only: all the rest is smooth."""
-    system = cb.ContinuousSystem(
-        lambda x, y: [-x, x - y], states=["x", "y"], diffusion=[[0.4, 0.0], [0.0, 0.4]]
-    )
+    system = cb.ContinuousSystem(lambda x, y: [-x, x - y], states=["x", "y"], diffusion=[[0.4, 0.0], [0.0, 0.4]])
     return cb.Problem(system, initial=[0.5, 0.0], safe=[cb.Inside(cb.Box([-3, -3], [1, 3]))], horizon=2.0)
 
 
@@ -59,8 +57,7 @@ def test_cells_change_by_no_more_than_shares_tell() -> None:
         assert np.abs(np.diff(shape.sizes) / np.diff(shape.places)).max() < 0.3 * 3
 
 
-@pytest.mark.parametrize(("kind", "n"), [(Equation, 2), (SplitEquation, 2), (SplitEquation, 3)])
-def test_the_adjoint_is_the_transpose(kind: type[Equation] | type[SplitEquation], n: int) -> None:
+def _random_equation(kind: type[Equation] | type[SplitEquation], n: int) -> Equation | SplitEquation:
     rng = np.random.default_rng(0)
     nodes = [np.sort(rng.uniform(-1, 1, 9 + k)) for k in range(n)]
     shape = tuple(map(len, nodes))
@@ -70,9 +67,46 @@ def test_the_adjoint_is_the_transpose(kind: type[Equation] | type[SplitEquation]
         spread[k, k] = noise[k]
     dead = np.zeros(shape, dtype=bool)
     dead[0] = True
-    equation = kind(nodes, flow, spread, dead, rng.uniform(0, 1, shape))
-    x, y = rng.normal(size=shape), rng.normal(size=shape)
+    return kind(nodes, flow, spread, dead, rng.uniform(0, 1, shape))
+
+
+def test_the_adjoint_is_the_transpose() -> None:
+    equation, rng = _random_equation(Equation, 2), np.random.default_rng(1)
+    x, y = rng.normal(size=(2, *equation.shape))
     assert np.vdot(equation.adjoint(0.01, x), y) == pytest.approx(np.vdot(x, equation.solve(0.01, y)), rel=1e-9)
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.1, 1.0])
+def test_systems_without_a_matrix_are_solved_where_a_step_leads_over_many_cells(share: float) -> None:
+    nodes = [np.cumsum(np.append(0.0, np.linspace(0.02, 0.08, 24))) for _ in range(3)]
+    x, y, z = np.meshgrid(*nodes, indexing="ij")
+    flow, spread = np.array([4 * (y - x), 5 - y, x * y - 10 * z]), np.zeros((3, 3, *x.shape))
+    for k in range(3):
+        spread[k, k] = 0.1
+    dead = np.zeros(x.shape, dtype=bool)
+    for face in np.array([0, -1]):
+        dead[face], dead[:, face], dead[:, :, face] = True, True, True
+    equation = SplitEquation(nodes, flow, spread, dead, np.zeros(x.shape))
+    right = np.sin(3 * x) * np.cos(2 * y) * z * ~dead
+    found = equation.solve(share, right)
+    left = found - share * equation.speed(found) - right
+    assert np.linalg.norm(left) <= 0.02 * np.linalg.norm(right)
+
+
+def test_the_adjoint_without_a_matrix_moves_paths_by_the_flow_and_loses_none() -> None:
+    nodes = [np.linspace(-1, 1, 41)] * 3
+    shape = (41, 41, 41)
+    flow = np.broadcast_to(np.array([1.0, -2.0, 0.5]).reshape(3, 1, 1, 1), (3, *shape))
+    spread = np.zeros((3, 3, *shape))
+    spread[0, 0] = 0.01
+    equation = SplitEquation(nodes, flow, spread, np.zeros(shape, dtype=bool), np.zeros(shape))
+    there = np.zeros(shape)
+    there[20, 20, 20] = 1.0
+    later = equation.adjoint(0.05, there)
+    assert later.min() >= 0.0
+    assert later.sum() == pytest.approx(1.0, rel=1e-5)
+    places = np.array(np.meshgrid(*nodes, indexing="ij"))
+    assert (later * places).sum(axis=(1, 2, 3)) == pytest.approx([0.05, -0.1, 0.025], rel=1e-3)
 
 
 @pytest.mark.parametrize("pads", [((0, 0), (0, 0)), ((9, 5), (0, 3))])

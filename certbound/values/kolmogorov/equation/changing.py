@@ -1,8 +1,8 @@
 """The backward equation in floats where its coefficients change, with time or as the worst disturbance does.
 
-W-methods of third order, whose Jacobian may be any: that of an earlier step serves as long as what has changed since
-moves nothing by more than a cell within a step. In two states it is the stiffly accurate one of Rang and Angermann
-(2005, ROS34PW2), in three the one of `solve`, which takes the split Jacobian. Nothing here is trusted.
+A W-method of third order, whose Jacobian may be any: that of an earlier step serves as long as what has changed since
+moves nothing by more than a cell within a step. This is the stiffly accurate one of Rang and Angermann (2005,
+ROS34PW2). Nothing here is trusted.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from certbound.arrays import Array, Mask
 from certbound.values.kolmogorov.equation.solve import (
     CENTRAL,
     NOISE,
-    SPLIT_DIAGONAL,
-    SPLIT_METHOD,
     Discretised,
     Source,
     banded,
@@ -67,9 +65,7 @@ class ChangingEquation:
         self.frozen: tuple[Discretised, Array, Array] | None = None
         self.kept: dict[float, tuple[Discretised, Array, Array]] = {}
         self.known: dict[float, tuple[Array, Array]] = {}
-        accurate = len(nodes) < 3
-        self.method = _in_solves(*map(np.array, _ACCURATE)) if accurate else SPLIT_METHOD
-        self.diagonal = _G if accurate else SPLIT_DIAGONAL
+        self.method = _in_solves(*map(np.array, _ACCURATE))
         gaps = [np.minimum(np.append(np.diff(line), np.inf), np.append(np.inf, np.diff(line))) for line in nodes]
         self.gaps = [gap.reshape([-1 if k == i else 1 for k in range(len(nodes))]) for i, gap in enumerate(gaps)]
 
@@ -102,11 +98,11 @@ class ChangingEquation:
 
     def solve(self, share: float, values: Array) -> Array:
         """About (1 - share L)^-1 values."""
-        return self._jacobian(share / self.diagonal).solve(share, values)
+        return self._jacobian(share / _G).solve(share, values)
 
     def adjoint(self, share: float, values: Array) -> Array:
         """About the same with the transposed matrix."""
-        return self._jacobian(share / self.diagonal).adjoint(share, values)
+        return self._jacobian(share / _G).adjoint(share, values)
 
     def _jacobian(self, step: float) -> Discretised:
         """Of this time, or of another one that is as good."""
@@ -139,7 +135,7 @@ class ChangingEquation:
             right = self.speed(place, source(part), given(part), step * part)
             for j in range(i):
                 right = right + mixed[i, j] / step * stages[j]
-            stages.append(jacobian.solve(step * self.diagonal, step * self.diagonal * right))
+            stages.append(jacobian.solve(step * _G, step * _G * right))
         return np.asarray(values + sum(weight * one for weight, one in zip(weights, stages)))
 
 

@@ -7,13 +7,14 @@ Alexander's third-order L-stable one (Alexander 1977, three stages).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as sl
 
-from certbound.arrays import Array, Mask
+from certbound.arrays import Array, Index, Mask
 from certbound.lazy import compiled
 from certbound.values.kolmogorov.splines import Banded, back, thin
 
@@ -23,34 +24,11 @@ _FIRST = -(6 * GAMMA**2 - 16 * GAMMA + 1) / 4
 _SECOND = (6 * GAMMA**2 - 20 * GAMMA + 5) / 4
 
 
-def _method() -> tuple[Array, Array, Array, Array]:
-    """Stage matrix, mixing matrix, weights and stage shares of the W-method, for stages that hold h k_i / gamma."""
-    alpha, gamma = np.zeros((4, 4)), np.eye(4) * _DIAGONAL
-    rows = np.tril_indices(4, -1)
-    alpha[rows], gamma[rows] = _ALPHA, _GAMMAS
-    inverse = np.linalg.inv(gamma)
-    mixing = np.eye(4) / _DIAGONAL - inverse
-    shares = np.zeros(4)
-    for i in range(4):
-        shares[i] = _DIAGONAL * (1 + mixing[i, :i] @ shares[:i])
-    return alpha @ inverse, mixing, _BETA @ inverse, shares
-
-
-_DIAGONAL = 0.4358665
-_BETA = np.array([1.3879562598812465, -0.3364971634337403, 0.21948826650908373, -0.27094736295658994])
-_ALPHA = np.array([-1.2966101254706222, 0.5964859394598576, -0.5178791536492169, -0.12819116594361657,
-                   0.04928120740632802, -0.09249271923552177])  # fmt: skip
-_GAMMAS = np.array([1.5858475867137631, -1.7098002380945074, 1.0515060232471816, -0.592385327006548,
-                    0.20098564717326586, -0.5027022888802305])  # fmt: skip
-_STAGE, _MIXED, _WEIGHTS, _SHARES = _method()
-
-SPLIT_METHOD = _STAGE, _MIXED, _WEIGHTS, np.array([float(_STAGE[i, :i] @ _SHARES[:i]) for i in range(4)])
-"""Stage and mixing matrices, weights and times of that method."""
-SPLIT_DIAGONAL = _DIAGONAL
-
 Stencils = Sequence[tuple[int, int]]
 DRIFT: Stencils = ((-2, 3), (-1, 2))
 """Upwind, where the drift is positive: of fifth order, of third where that does not fit or little noise smooths."""
+_SOLVED, _ITERATIONS = 1e-2, 30  # relative residual at which a system counts as solved; iterations at most
+_WINDOW = 5  # nodes of the widest of the differences of `SplitEquation`
 _PECLET = 10.0  # of drift times width to squared noise, beyond which differences of fifth order may grow
 NOISE: Stencils = ((-3, 3), (-2, 2))
 CENTRAL: Stencils = ((-2, 2),)
@@ -106,7 +84,31 @@ def upwind(nodes: Array, smooth: bool) -> tuple[sp.csr_array, sp.csr_array]:
     return difference(nodes, stencils, 1), difference(nodes, [(-last, -first) for first, last in stencils], 1)
 
 
-class Equation:
+class _Stepped(Protocol):
+    """A step of the Runge-Kutta method, for whatever solves."""
+
+    def speed(self, values: Array, source: Array | float = 0.0, given: Array | float = 0.0) -> Array:
+        """-u_t: L u and the source at live nodes, what is given at the others."""
+        ...
+
+    def solve(self, share: float, values: Array) -> Array:
+        """(1 - share L)^-1 values."""
+        ...
+
+    def step(self, values: Array, step: float, source: Source, given: Source) -> Array:
+        """One step backward in time."""
+        share = GAMMA * step
+
+        def stage(at: Array, part: float) -> Array:
+            return self.solve(share, self.speed(at, source(part), given(part)))
+
+        first = stage(values, GAMMA)
+        second = stage(values + step * (_MIDDLE - GAMMA) * first, _MIDDLE)
+        partial = values + step * (_FIRST * first + _SECOND * second)
+        return partial + step * GAMMA * stage(partial, 1.0)
+
+
+class Equation(_Stepped):
     """u_t + L u - rate (u - goal) + s = 0 on the nodes of a tensor grid.
 
     Parameters
@@ -170,24 +172,15 @@ class Equation:
             )
         return self.inverses[key]
 
-    def step(self, values: Array, step: float, source: Source, given: Source) -> Array:
-        """One step backward in time."""
-        share = GAMMA * step
 
-        def stage(at: Array, part: float) -> Array:
-            return self.solve(share, self.speed(at, source(part), given(part)))
+class SplitEquation(_Stepped):
+    """The same without factors of a matrix, for three states and more.
 
-        first = stage(values, GAMMA)
-        second = stage(values + step * (_MIDDLE - GAMMA) * first, _MIDDLE)
-        partial = values + step * (_FIRST * first + _SECOND * second)
-        return partial + step * GAMMA * stage(partial, 1.0)
-
-
-class SplitEquation:
-    """The same without a matrix, for three states and more.
-
-    A four-stage W-method of third order (any approximate Jacobian will do): the Jacobian is a product over the axes of
-    tridiagonal factors, of first order upwind for drift.
+    Systems are solved by BiCGSTAB (van der Vorst 1992). Its preconditioner solves, of the equation with drift of first
+    order upwind, the tridiagonal systems along the lines of one axis after the other (line Gauss-Seidel): layers and
+    strong drift across many cells are met by it, and what is smooth over many cells changes little within a step. A
+    product of tridiagonal factors, once a step, would do where a step moves nothing by more than a cell or so; where it
+    does, such a method hardly moves at all.
 
     Parameters
     ----------
@@ -197,17 +190,16 @@ class SplitEquation:
     def __init__(self, nodes: Sequence[Array], flow: Array, spread: Array, dead: Mask, rate: Array) -> None:
         self.nodes, self.shape, self.live = list(nodes), flow.shape[1:], ~dead
         self.rate = rate * self.live
+        self.known: tuple[float, list[tuple[Array, Array, Array]]] = (0.0, [])
         n = len(nodes)
-        self.terms: list[tuple[int, Banded, Array]] = []
+        self.along: list[_Stencil] = []
         self.mixed: list[tuple[int, int, Banded, Banded, Array]] = []
         self.ahead: list[Array] = []
         self.behind: list[Array] = []
         for i in range(n):
             f, a = flow[i] * self.live, spread[i, i] / 2 * self.live
-            up, down = upwind(nodes[i], False)
-            self.terms += [(i, banded(up), np.maximum(f, 0)), (i, banded(down), np.minimum(f, 0))]
-            if a.any():
-                self.terms.append((i, banded(difference(nodes[i], NOISE[-1:], 2)), a))
+            if f.any() or a.any():
+                self.along.append(_Stencil.of(i, nodes[i], f, a))
             gaps = np.diff(nodes[i])
             shape = [-1 if k == i else 1 for k in range(n)]
             ahead, behind = np.append(gaps, gaps[-1]).reshape(shape), np.append(gaps[0], gaps).reshape(shape)
@@ -220,43 +212,92 @@ class SplitEquation:
                 if spread[i, j].any():
                     first, second = (banded(difference(nodes[k], CENTRAL, 1)) for k in (i, j))
                     self.mixed.append((i, j, first, second, spread[i, j] * self.live))
-        self.terms = [term for term in self.terms if term[2].any()]
+
+    def _generated(self, values: Array) -> Array:
+        """L u - rate u, 0 at nodes whose values are given."""
+        total = np.ascontiguousarray(-self.rate * values)
+        for stencil in self.along:
+            stencil.add(total, values)
+        for i, j, first, second, factor in self.mixed:
+            total += factor * first.along(second.along(values, j), i)
+        return total
 
     def speed(self, values: Array, source: Array | float = 0.0, given: Array | float = 0.0) -> Array:
         """-u_t: L u and the source at live nodes, what is given at the others."""
-        total = source - self.rate * values
-        for axis, matrix, factor in self.terms:
-            total += factor * matrix.along(values, axis)
-        for i, j, first, second, factor in self.mixed:
-            total += factor * first.along(second.along(values, j), i)
-        return np.where(self.live, total, given)
+        return np.where(self.live, self._generated(values) + source, given)
 
     def solve(self, share: float, values: Array) -> Array:
-        """About (1 - share L)^-1 values."""
-        values = values / (1 + share * self.rate)
-        for axis, (ahead, behind) in enumerate(zip(self.ahead, self.behind)):
-            values = solve_along(values, axis, share * ahead, share * behind)
-        return values
+        """(1 - share L)^-1 values, to about `_SOLVED`."""
+
+        def applied(row: Array) -> Array:
+            one = row.reshape(self.shape)
+            return np.asarray(one - share * self._generated(one)).ravel()
+
+        def relaxed(row: Array) -> Array:
+            given = row.reshape(self.shape)
+            result = np.zeros(self.shape)
+            rest = given
+            for axis, (scale, ahead, behind) in enumerate(self._lines(share)):
+                result = result + solve_along(rest * scale, axis, ahead, behind)
+                if axis < len(self.shape) - 1:
+                    rest = given - result + share * self._generated(result)
+            return result.ravel()
+
+        size = values.size
+        matrix, inverse = (sl.LinearOperator((size, size), matvec=one, dtype=float) for one in (applied, relaxed))
+        first = relaxed(values.ravel())
+        solution, _ = sl.bicgstab(matrix, values.ravel(), first, rtol=_SOLVED, maxiter=_ITERATIONS, M=inverse)
+        return np.asarray(solution).reshape(self.shape)
+
+    def _lines(self, share: float) -> list[tuple[Array, Array, Array]]:
+        """For each axis: 1 / the diagonal without its own line's terms, and these terms times it."""
+        if self.known[0] != share:
+            own = [share * (ahead + behind) for ahead, behind in zip(self.ahead, self.behind)]
+            rows = []
+            for i, (ahead, behind) in enumerate(zip(self.ahead, self.behind)):
+                scale = 1 / (1 + share * self.rate + sum(one for k, one in enumerate(own) if k != i))
+                rows.append((scale, share * ahead * scale, share * behind * scale))
+            self.known = (share, rows)
+        return self.known[1]
 
     def adjoint(self, share: float, values: Array) -> Array:
-        """The same with the transposed factors: where paths from ``values`` are after a time ``share``."""
+        """About where paths from ``values`` are after a time ``share``: one axis after the other."""
         for axis in reversed(range(len(self.nodes))):
             values = solve_along(values, axis, share * self.ahead[axis], share * self.behind[axis], transposed=True)
         return values / (1 + share * self.rate)
 
-    def step(self, values: Array, step: float, source: Source, given: Source) -> Array:
-        """One step backward in time."""
-        stages: list[Array] = []
-        for i in range(4):
-            place = values
-            for j in range(i):
-                place = place + _STAGE[i, j] * stages[j]
-            part = float(_STAGE[i, :i] @ _SHARES[:i])
-            right = self.speed(place, source(part), given(part))
-            for j in range(i):
-                right = right + _MIXED[i, j] / step * stages[j]
-            stages.append(self.solve(step * _DIAGONAL, step * _DIAGONAL * right))
-        return np.asarray(values + sum(weight * stage for weight, stage in zip(_WEIGHTS, stages)))
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Stencil:
+    """f d + a d^2 / 2 along one axis: where each node's window begins, and the weights of the nodes in it.
+
+    ``weights`` has shape (nodes of a window, ..., nodes, ...), the grid's with its axes before and behind run together.
+    """
+
+    axis: int
+    start: Index
+    weights: Array
+
+    @classmethod
+    def of(cls, axis: int, nodes: Array, flow: Array, half: Array) -> _Stencil:
+        """Of drift and half of the squared noise at all nodes."""
+        up, down = upwind(nodes, False)
+        count = len(nodes)
+        start = np.clip(np.arange(count) - _WINDOW // 2, 0, count - _WINDOW).astype(np.intp)
+        columns = start[:, None] + np.arange(_WINDOW)
+        total = np.zeros((_WINDOW, *thin(flow, axis).shape))
+        for matrix, factor in (
+            (up, np.maximum(flow, 0)),
+            (down, np.minimum(flow, 0)),
+            (difference(nodes, CENTRAL, 2), half),
+        ):
+            rows = np.take_along_axis(matrix.toarray(), columns, axis=1)
+            total += rows.T[:, None, :, None] * thin(np.ascontiguousarray(factor), axis)
+        return cls(axis=axis, start=start, weights=total)
+
+    def add(self, total: Array, values: Array) -> None:
+        """Add the image of ``values`` to contiguous memory."""
+        _weighed(thin(total, self.axis), thin(values, self.axis), self.start, self.weights)
 
 
 Discretised = Equation | SplitEquation
@@ -274,6 +315,30 @@ def banded(matrix: sp.csr_array) -> Banded:
     width = max(int(np.flatnonzero(row)[-1] - first) + 1 for row, first in zip(dense, start))
     start = np.minimum(start, dense.shape[1] - width).astype(np.intp)
     return Banded(start, np.ascontiguousarray(np.take_along_axis(dense, start[:, None] + np.arange(width), axis=1)))
+
+
+@compiled
+def _weighed(out, values, start, w):  # type: ignore[no-untyped-def]
+    """out[p, j, q] += sum_k w[k, p, j, q] values[p, start[j] + k, q] over five k."""
+    if values.shape[2] == 1:
+        for p in range(values.shape[0]):
+            for j in range(start.size):
+                s = start[j]
+                out[p, j, 0] += (
+                    w[0, p, j, 0] * values[p, s, 0] + w[1, p, j, 0] * values[p, s + 1, 0]
+                    + w[2, p, j, 0] * values[p, s + 2, 0] + w[3, p, j, 0] * values[p, s + 3, 0]
+                    + w[4, p, j, 0] * values[p, s + 4, 0]
+                )  # fmt: skip
+        return
+    for p in range(values.shape[0]):
+        for j in range(start.size):
+            s = start[j]
+            for q in range(values.shape[2]):
+                out[p, j, q] += (
+                    w[0, p, j, q] * values[p, s, q] + w[1, p, j, q] * values[p, s + 1, q]
+                    + w[2, p, j, q] * values[p, s + 2, q] + w[3, p, j, q] * values[p, s + 3, q]
+                    + w[4, p, j, q] * values[p, s + 4, q]
+                )  # fmt: skip
 
 
 @compiled
