@@ -46,7 +46,8 @@ from certbound.values.kolmogorov.splines import (
 )
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
-_FIRST, _GROWTH = 12, 1.3  # steps within that layer, and how they grow: a front leaves it sharp, and blurs slowly
+_FIRST = 12  # steps within that layer
+_GROWTH = {2: 1.15, 3: 1.3}  # of these steps: a front leaves it sharp, and blurs slowly; by the number of states
 _AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
 _OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
 _MARGIN = 0.1  # by which a source exceeds what it pays for
@@ -68,9 +69,9 @@ def ramp(y: Array) -> Array:
     return np.asarray(z**3 * (10 - 15 * z + 6 * z * z))
 
 
-def time_steps(horizon: float, count: int, layer: float) -> Array:
+def time_steps(horizon: float, count: int, layer: float, growth: float) -> Array:
     """Lengths of the steps from the end backward: small in the end layer, growing to horizon / count."""
-    return _graded(horizon, horizon / count, layer / _FIRST, _GROWTH)
+    return _graded(horizon, horizon / count, layer / _FIRST, growth)
 
 
 def _graded(length: float, largest: float, first: float, growth: float) -> Array:
@@ -84,7 +85,7 @@ def _graded(length: float, largest: float, first: float, growth: float) -> Array
     return np.array(result + [rest / more] * more)
 
 
-def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Array) -> Array:
+def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Array, growth: float) -> Array:
     """Times of the knots, from the horizon back: as `time_steps`, with two about every break.
 
     Before a break, backward in time, a solution that does not fit the new coefficients at faces has a layer in time.
@@ -94,9 +95,9 @@ def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Arr
     passed = [0.0]
     for k, end in enumerate(ends):
         last = end - half if k < len(breaks) else end
-        first, growth = (layer / _FIRST, _GROWTH) if k == 0 else (layer * _AFTER, _QUICKER)
+        first, faster = (layer / _FIRST, growth) if k == 0 else (layer * _AFTER, _QUICKER)
         so_far = passed[-1]
-        passed += list(so_far + np.cumsum(_graded(last - so_far, largest, first, growth)))
+        passed += list(so_far + np.cumsum(_graded(last - so_far, largest, first, faster)))
         passed[-1] = last
         if k < len(breaks):
             passed.append(end + half)
@@ -339,7 +340,7 @@ class Side:
         )
         self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh)
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
-        self.steps = time_steps(span * longer, steps, self.layer)
+        self.steps = time_steps(span * longer, steps, self.layer, _GROWTH[setting.dimension])
         self._follow_changes(int(np.ceil(setting.pace * steps)))
         sketched = tuple(Axis(line, Sampling(_SKETCH)) for line in nodes)
         self.generator, self.sketch = (_generator(setting, axes) for axes in (self.axes, sketched))
@@ -412,7 +413,7 @@ class Side:
         self.clock: Array | None = None
         self.times = horizon - np.append(0.0, np.cumsum(self.steps))
         if setting.timed or setting.staged:  # a stage is as long as it is
-            self.times = knots_of(begin, horizon, steps, self.layer, setting.breaks)
+            self.times = knots_of(begin, horizon, steps, self.layer, setting.breaks, _GROWTH[setting.dimension])
             self.steps = -np.diff(self.times)
             self.brief = self.steps < 4 * HALF * horizon
             self.clock = 2 * CLOCK * horizon / self.steps
