@@ -163,7 +163,7 @@ def _(data: Data) -> None:
 
 @forges("a path is over on cells that may hold the target", "arrived below", _LIMITS, "StageLimits", LESS)
 def _(data: Data) -> None:
-    _scale(data["problem"]["reach"]["region"]["low"], 0, 0.97)
+    _scale(data["problem"]["reach"]["region"]["low"], 0, 0.9)
 
 
 @forges("v is at least 0 where paths may meet the target", "arrived below", _STAGE, "Stage._at_target", LESS)

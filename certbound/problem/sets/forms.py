@@ -224,8 +224,13 @@ class Region:
         return list(range(dimension) if self.coordinates is None else self.coordinates)
 
     def touched(self, dimension: int) -> set[int]:
-        """The indices of the states, of ``dimension``, that decide whether a state lies in the set."""
+        """The indices of the states, of ``dimension``, that decide whether a state lies in the set.
+
+        Where its sides move, all of those that it lives in.
+        """
         places = np.array(self.places(dimension))
+        if self.changing:
+            return {int(place) for place in places}
         form = self.form
         bounded = np.any(form.normals != 0, axis=0) if isinstance(form, Faces) else np.ones(len(places), dtype=bool)
         return {int(place) for place in places[bounded]}

@@ -82,8 +82,8 @@ class LinearAnswer:
         log = logsumexp(np.array([outcome.shared, *(outcome.logs[place] for place in places)]))
         if outcome.unshared:
             log = min(log, logsumexp(np.array([outcome.unshared[place] for place in places])))
-        value = log / np.log(10.0)
-        return max(float(value + 1e-14 * (1 + abs(value))), answer_tubes.LEAST)
+        value = max(float(log / np.log(10.0)), answer_tubes.LEAST)  # minus infinity where nothing can leave
+        return max(value + 1e-14 * (1 + abs(value)), answer_tubes.LEAST)
 
     @cached_property
     def _tightest(self) -> tuple[Requirement | None, int, float]:
