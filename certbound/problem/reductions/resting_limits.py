@@ -373,7 +373,7 @@ class _Resting:
     # ---- the problem in these coordinates ----------------------------------------------------------------------
 
     def _stated(self, *, narrow: bool) -> tuple[Problem | None, str]:
-        """The problem with sets that are no larger than the stated ones (``narrow``), or no smaller; or why there is none."""
+        """The problem with sets no larger than the stated ones (``narrow``), or no smaller; or why there is none."""
         problem, system = self.problem, self.problem.system
         law, signals = isinstance(problem.plan, Tape), dict[str, Any]()
         if system.inputs is not None and not law:
