@@ -7,9 +7,11 @@ import pytest
 
 import certbound as cb
 from certbound.errors import EnclosureError
+from certbound.problem.model import trace
 from certbound.rigor.intervals import Interval
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.cell_fields import Fields
+from certbound.values.kolmogorov.factors import Factor
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.splines import Axis, Derivatives, Sampling, most_on_cells
 
@@ -151,9 +153,22 @@ def test_the_residual_of_a_random_function_lies_below_its_bound_everywhere(name:
         assert np.all(r <= bound[slab][cells] + 1e-9)
 
 
-def _constant_fields(axes: tuple[Axis, ...], a: np.ndarray) -> list:
-    from certbound.problem.model import trace
+def test_for_the_best_of_some_disturbances_one_and_the_same_serves_what_is_straight_and_what_bulges() -> None:
+    """v = x p(t) with p = s (1 - s) - 1/16 and r = v_t + d v_x: with d = 1 what is straight is -1/16, with d = -1 what
+    bulges is at most 0, but r exceeds 1/16 somewhere for either of them (|x| is at most .001)."""
+    line = Axis(np.linspace(-1e-3, 1e-3, 9), Sampling(2))
+    axes = (line, Axis(np.arange(9.0), Sampling(2)))
+    tape = trace(lambda t, x: [1.0, 0.0], {"t": ["t"], "x": ["x", "y"]})
+    along, _ = Fields(tape, 2).on(axes, Interval.point(0.0))
+    generator = Generator.of(axes, ([along, None], [None] * 4))
+    either = Factor(bernstein=np.array([1.0, -1.0]).reshape(2, 1, 1), error=np.zeros((2, 1)), between=np.zeros(1))
+    x = np.array([line.knots[k + 1 : k + 6].mean() for k in range(line.cells + 5)])[:, None] * np.ones(13)
+    values, rates = np.stack([-x / 16, -x / 16]), np.stack([-x, x])
+    bound = residual_bound(generator, generator, values, rates, np.array([1.0]), [either], worst=False)
+    assert np.all(bound >= 1 / 16 - 2e-3)
 
+
+def _constant_fields(axes: tuple[Axis, ...], a: np.ndarray) -> list:
     tape = trace(lambda t, x: [float(entry) for entry in a.ravel()], {"t": ["t"], "x": ["x", "y"]})
     return Fields(tape, 2).on(axes, Interval.point(0.0))
 
