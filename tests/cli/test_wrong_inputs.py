@@ -335,7 +335,8 @@ def test_a_program_that_is_stopped_from_outside(tmp_path: Path) -> None:
         signal.signal(signal.SIGINT, before)
     assert process.returncode == 130
     assert out == ""
-    assert len(err.splitlines()) == 3
+    said = [line for line in err.splitlines() if not line.startswith("simulating: ")]  # how far it was, after 10 s
+    assert len(said) == 3
     assert "Traceback" not in err
 
 
