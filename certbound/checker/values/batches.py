@@ -148,7 +148,8 @@ class Batch:
             mine, one = (yours, two) if x is self else x._parts()
             boxes = len(x.error)
             pairs = min(sum(mine) * sum(yours), sum(len(which.kept[i]) for i, there in enumerate(mine) if there))
-            which.budget.floats((2 * pairs + which.degree**2) * boxes + 3 * which.numbers(boxes), pairs + which.degree)
+            numbers = (2 * pairs + which.degree**2) * boxes + 3 * which.numbers(boxes)
+            which.budget.floats(numbers, pairs + which.degree + 15)
             coefficients = np.zeros_like(x.coefficients)
             into = list(coefficients)
             for i, own in enumerate(x.coefficients):
@@ -239,7 +240,7 @@ def joined(parts: list[Batch]) -> Batch:
 def fixed(which: Terms, value: Array, error: Array | float = 0.0) -> Batch:
     """Constants, each known up to an error."""
     which.budget.fits(8 * which.numbers(len(value)))
-    which.budget.floats(which.numbers(len(value)))
+    which.budget.floats(which.numbers(len(value)), 3)
     coefficients = np.zeros((len(which.exponents), len(value)))
     coefficients[0] = value
     return Batch(which, coefficients, np.broadcast_to(np.asarray(error, dtype=float), value.shape))
@@ -315,7 +316,7 @@ def composed(x: Batch, function: Callable[[Series], Series]) -> Batch:
     """
     order = x.terms.degree
     reach = np.where(np.isfinite(x.error), x.reach(), np.inf)
-    x.terms.budget.floats(60 * len(reach), 20)
+    x.terms.budget.floats(60 * len(reach), 200)
     pairs, back = np.unique(np.stack([x.value, reach], axis=1), axis=0, return_inverse=True)
     x.terms.budget.balls(len(pairs) * (order + 2) ** 2 * 8)
     x.terms.budget.balls(len(pairs) * (order + 8), FUNCTION)

@@ -59,7 +59,7 @@ _REACHED = 1.5
 _ON_FACE = 0.3  # of the source that would raise e to what v lacks while a path crosses one cell
 _BATCH = 300_000  # lattice points of the slabs that are looked at together
 _RESOLVED = 3.0  # of the flow against paths times the width of a cell to squared noise
-_SKETCH = 2  # points along each axis of a cell, where nothing is proved of its residual
+_SKETCH = 3  # degree of interpolants where little is at stake: of bulges, and where nothing is proved
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
 
@@ -322,7 +322,7 @@ class Side:
     """
 
     def __init__(
-        self, setting: Setting, cell: Array, steps: int, above: bool, parts: int = 4, later: Side | None = None,
+        self, setting: Setting, cell: Array, steps: int, above: bool, parts: int = DEGREE, later: Side | None = None,
         plan: Plan | None = None,
     ) -> None:  # fmt: skip
         self.setting, self.above, self.later, self.cell, self.count = setting, above, later, cell, steps
@@ -375,8 +375,13 @@ class Side:
 
     @property
     def begun(self) -> bool:
-        """Whether the next source is still about the residual, and not above it."""
-        return self.passes < len(BREADTHS) - 1
+        """Whether the next source is about the residual, and may come from one that is not proved."""
+        return self.passes == 0
+
+    @property
+    def steady(self) -> bool:
+        """Whether all sources from now on are above the residual."""
+        return self.passes >= len(BREADTHS)
 
     def _cells_arrived(self, setting: Setting) -> Mask:
         """Cells within the target of a stage, whose faces stand on nodes."""
@@ -612,8 +617,11 @@ class Side:
         lattice = int(np.prod([axis.sampling.parts for axis in (self.sketch if rough else self.generator).axes]))
         many = max(1, _BATCH * len(self.steps) // (lattice * self.own_work))
         knots: Array | None = None
+        same = all(one is None for one in self.factors)
+        if same:  # what the threads share
+            _ = (self.sketch.images, rough or self.generator.images)
         with ThreadPoolExecutor(2) as pool:
-            if not rough and all(one is None for one in self.factors):
+            if not rough and same:
                 groups = [slice(k, k + many) for k in range(0, len(self.values), many)]
                 knots = np.concatenate(list(pool.map(self._at_knots, groups)))
             parts = pool.map(lambda k: self._bounded(rough, k, k + many, knots), range(0, len(self.steps), many))

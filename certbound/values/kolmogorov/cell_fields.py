@@ -5,6 +5,8 @@ On every cell F = p + E, p the tensor interpolant of F through the cell's lattic
 
     |E| <= sum_i C^i c h_i^(m+1) sup |d_i^(m+1) F|,     and where F has a kink or a jump on the cell
     |E| <= (1 + C^n) rad F(cell).
+
+Where d_i^k F vanishes identically, so does d_i^k p: the interpolants of the other axes are taken of it.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ class Field:
     error : ndarray, shape (N_1, ...)
         Bound of |E| on every cell.
     slopes : tuple of tuple of ndarray
-        ``slopes[i][k]`` bounds |d_i^k p|, k = 0, ..., m.
+        ``slopes[i][k]`` bounds |d_i^k p|, k = 0, ..., m, as long as it is not 0 everywhere.
     """
 
     lattice: Array
@@ -58,6 +60,11 @@ def derivative_of(tape: Tape, axis: int, order: int) -> Tape:
     return tape
 
 
+def _present(tape: Tape) -> tuple[bool, ...]:
+    """Which outputs of a tape do not vanish identically."""
+    return tuple(tape.nodes[output] != Node("const", (), 0.0) for output in tape.outputs)
+
+
 class Fields:
     """The outputs of a tape on grids; functions that vanish identically are left out.
 
@@ -71,8 +78,7 @@ class Fields:
 
     def __init__(self, tape: Tape, dimension: int) -> None:
         self.tape, self.dimension = tape, dimension
-        zero = Node("const", (), 0.0)
-        self.present = tuple(tape.nodes[output] != zero for output in tape.outputs)
+        self.present = _present(tape)
         self.autonomous = all(node.op != "input" or node.args[0] != 0 for node in tape.nodes)
 
     def on(self, axes: tuple[Axis, ...], time: Interval, branch: Sequence[Interval] = ()) -> list[Field | None]:
@@ -91,10 +97,19 @@ class Fields:
             self._magnitudes(derivative_of(self.tape, k, axis.sampling.parts + 1), ends, time, branch)
             for k, axis in enumerate(axes)
         ]
-        result: list[Field | None] = []
-        for k, present in enumerate(self.present):
-            result.append(self._field(axes, points[k], ranges[k], edge, [t[k] for t in tails]) if present else None)
-        return result
+        most = [axis.sampling.parts for axis in axes]
+        degrees = [most if edge.any() else self._degrees(axes, k) for k in range(len(ranges))]
+        return [
+            self._field(axes, points[k], ranges[k], edge, [t[k] for t in tails], degrees[k]) if present else None
+            for k, present in enumerate(self.present)
+        ]
+
+    def _degrees(self, axes: tuple[Axis, ...], output: int) -> list[int]:
+        """The highest order along each axis, up to that of its interpolants, whose derivative does not vanish."""
+        return [
+            max(k for k in range(axis.sampling.parts + 1) if k == 0 or _present(derivative_of(self.tape, i, k))[output])
+            for i, axis in enumerate(axes)
+        ]
 
     def _enclosed(
         self, tape: Tape, low: list[Array], high: list[Array], time: Interval, branch: Sequence[Interval]
@@ -113,8 +128,9 @@ class Fields:
         return [np.asarray(value.mag) for value in values]
 
     def _field(
-        self, axes: tuple[Axis, ...], points: Interval, ranges: Interval, edge: Mask, tails: list[Array]
-    ) -> Field:
+        self, axes: tuple[Axis, ...], points: Interval, ranges: Interval, edge: Mask, tails: list[Array],
+        degrees: Sequence[int],
+    ) -> Field:  # fmt: skip
         lattice, radius = np.array(points.mid), over_cells(axes, np.array(points.rad))
         weights, smooth = 1.0, np.zeros(cells_of(axes))
         widths = [_along(axis.widths, k, len(axes)) for k, axis in enumerate(axes)]
@@ -132,10 +148,10 @@ class Fields:
         for k, (axis, width) in enumerate(zip(axes, widths)):
             spread = weights / axis.sampling.lebesgue
             rows = []
-            for order in range(axis.sampling.parts + 1):
+            for order in range(degrees[k] + 1):
                 matrix = axis.sampling.derivative(order)
                 along = cell_combinations(lattice, k, np.concatenate([matrix, -matrix]))
-                rounding = 1e-14 * np.abs(matrix).sum() * over_cells(axes, np.abs(lattice))
+                rounding = np.abs(matrix).sum() * (1e-14 * over_cells(axes, np.abs(lattice)) + radius)
                 rows.append((spread * over_cells(axes, along, skip=k) + rounding) / width**order * _UP)
             slopes.append(tuple(rows))
         return Field(lattice=lattice, error=error * _UP, slopes=tuple(slopes))

@@ -22,20 +22,25 @@ from certbound.values.kolmogorov.start_law import StartMean
 from certbound.values.kolmogorov.witness import Witness
 from certbound.watch import poll
 
-_COARSEST = {2: 0.06, 3: 0.1}  # cell of the first grid, as a share of the range
+_COARSEST = {2: 0.06, 3: .1}  # cell of the first grid, as a share of the range
 _STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
-_PASSES, _USUAL = 12, 5  # at most, and in most cases in units of one that proves
-_ROUGH = 0.3  # what a pass takes where nothing is proved
-_ROUNDS = 2  # grids whose axes are improved, before the first one on which anything is proved
+_PASSES, _USUAL = 12, 6  # at most, and in most cases
+_ROUGH, _CORRECTED = 0.4, 0.4  # a solution with a look at it, and one correction, in units of a pass that proves
+_WHOLE = _USUAL + _ROUGH + _CORRECTED  # what a grid takes
+_ROUNDS = (2, 1)  # grids whose axes are improved, at first and later on
+_STALLED = 0.7  # of what was left before: two passes that leave more are the last ones
 _CLOSE = 1.01  # ratio of the bounds that ends the search
 _PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
+_ENOUGH = 0.97  # of the target: a bound that low may be written down with fewer digits
 _GROWTH = 6.0  # the largest factor of work from one grid to the next
 _LEAST = 1.5  # the smallest one that is worth it
-_SHARE, _ORDER = 0.8, 2.0  # of what the target leaves, that an error may take; how fast errors fall with cells
+_CHEAP = 0.1  # of the work that is left: a proof that takes no more is made, whether it decides or not
+_PROVED = 2.7  # what is proved of the error, in units of what the first pass finds of it without proof, measured
+_SHARE, _ORDER = 0.8, 3.0  # of what the target leaves, that an error may take; how fast errors fall with cells
 _FAR = 2.0  # ratio of the coarsest solution to the target, beyond which it says which bound decides
 _FEWEST = 8  # steps of a stage
 _STARTS = 9  # points along each side of a start set
-RATE = {2: 1.8e5, 3: 7.0e4}
+RATE = {2: 1.8e5, 3: 1.1e5}
 """Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
 
 
@@ -133,7 +138,7 @@ class Search:
         self.sides: tuple[bool, ...] = (True,) if self.only else (True, False)
         self.shapes: dict[bool, Shapes] = {}
         self.kept: tuple[Witness, ...] = ()
-        self.estimate, self.carried = math.nan, 0.0
+        self.estimate, self.error = math.nan, 0.0
 
     def decided(self) -> bool:
         """Whether the bounds are near each other, or one of them has passed the target."""
@@ -144,50 +149,67 @@ class Search:
         while not self.decided():
             if self.cost and not self._finer(budget):
                 return
-            begun, self.runs = self.work, self.runs + 1
+            begun, self.runs, self.cost = self.work, self.runs + 1, 0.0
             for above in self.sides:
                 side = self._side(above)
-                if self.runs == 1 and self.work - begun + _USUAL * side.work > budget:  # an upper bound at least
-                    self.cost = self.work - begun
+                self.cost += _WHOLE * side.work
+                if self.runs == 1 and self.work - begun + _WHOLE * side.work > budget:  # an upper bound at least
                     yield self._bounds(side, proved=self.work > 0)
                     return
-                for stage in side.stages[::-1]:
-                    stage.propose()
-                self.estimate = abs(largest_at_start(side, self.starts)[0])
+                side = self._solved(side)
                 if above and len(self.sides) > 1 and self.estimate > _FAR * self.delta > 0:
                     continue
-                side = self._refined(side, budget)
-                self.cost = self.work - begun
-                yield self._bounds(side)
+                last = _LEAST * self.cost > budget - self.work
+                if last or self._worth(side, budget):
+                    self._prove(side, last)
+                    yield self._bounds(side)
                 if self.decided():
                     return
-                if above and _FAR * self.estimate < self.delta:
-                    self.sides = (True,)
+                if self.delta > 0 and (_FAR * self.estimate < self.delta or self.cost > _CHEAP * budget):
                     break
 
     def _side(self, above: bool) -> Side:
         count = math.ceil(_STEPS / self.cell)
         return side_of(self.stages, self.cell, count, above, _scaled(self.shapes.get(above), self.cell))
 
-    def _refined(self, side: Side, budget: float) -> Side:
-        """Prove a bound on one grid, after better axes; the side on these."""
+    def _solved(self, side: Side) -> Side:
+        """Solve on one grid, or on better ones with as many cells; the side on these, once corrected."""
         above = side.above
-        rounds = 0 if above in self.shapes or side.later is not None else _ROUNDS
+        for stage in side.stages[::-1]:
+            stage.propose()
+        rounds = _ROUNDS[0 if above not in self.shapes else 1]
         side, residuals = adapted(side, self.starts, rounds)
-        self.estimate = abs(largest_at_start(side, self.starts)[0])
-        last = (1 + _LEAST) * _USUAL * side.work > budget - self.work
-        target = math.inf if last or not self.delta else self.delta if above else -self.delta
+        value = largest_at_start(side, self.starts)[0]
+        self.estimate, self.error = abs(value), math.inf
+        self.work += _ROUGH * (1 + rounds) * side.work
         if residuals is not None:
             self.shapes[above] = (self.cell, better_shapes(side, residuals, self.starts.places))
-        bound, value, passes = refined(side, self.starts, target, residuals)
-        self.work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
+            side.correct(residuals)
+            self.work += _CORRECTED * side.work
+            self.error = abs(largest_at_start(side, self.starts)[0] - value)
+        return side
+
+    def _worth(self, side: Side, budget: float) -> bool:
+        """Whether a bound of this grid is worth its proof: it will decide, it is cheap, or nothing is known of it."""
+        if not self.delta or not math.isfinite(self.error):
+            return True
+        if side.above == (self.estimate < self.delta) and _USUAL * side.work <= _CHEAP * (budget - self.work):
+            return True
+        found = self.estimate + (1 if side.above else -1) * _PROVED * self.error
+        return found <= self.delta if side.above else found > self.delta
+
+    def _prove(self, side: Side, last: bool) -> None:
+        above = side.above
+        target = math.inf if last or not self.delta else self.delta if above else -self.delta
+        enough = -math.inf if not self.delta else _ENOUGH * self.delta if above else -self.delta / _ENOUGH
+        bound, value, passes = refined(side, self.starts, target, enough=enough)
+        self.work += passes * side.work
         self.kept += Witness.of(side)
-        self.carried = abs(abs(value) - self.estimate)
+        self.error = abs(abs(value) - self.estimate) / _PROVED
         if above:
             self.upper = min(self.upper, bound)
         else:
             self.lower = max(self.lower, -bound)
-        return side
 
     def _finer(self, budget: float) -> bool:
         """Choose the next grid by the work that is left; False where that is too little for one that is worth it."""
@@ -197,7 +219,7 @@ class Search:
             return False
         if delta > 0:
             room = _SHARE * abs(delta - self.estimate)
-            needed = (self.carried / max(room, 1e-300)) ** ((dimension + 1) / _ORDER)
+            needed = (_PROVED * self.error / max(room, 1e-300)) ** ((dimension + 1) / _ORDER)
             growth = min(max(min(growth, needed), _LEAST) * len(self.sides), _GROWTH)
             self.sides = (self.estimate < delta or self.only,)
         self.cell /= growth ** (1 / (dimension + 1))
@@ -247,14 +269,15 @@ def side_of(
 
 
 def refined(
-    side: Side, starts: Starts, target: float = math.inf, residuals: list[Array] | None = None
+    side: Side, starts: Starts, target: float = math.inf, residuals: list[Array] | None = None, *,
+    enough: float = -math.inf,
 ) -> tuple[float, float, float]:  # fmt: skip
     """The bound of one side: passes of the carried error until what is left of the residual is paid.
 
-    Passes end early once v at the start, which only grows, is beyond ``target``; the first ``residuals`` may be known.
-    The bound, v there, and what it took in passes.
+    Passes end early once v at the start, which only grows, is beyond ``target``, or the bound is below ``enough``; the
+    first ``residuals`` may be known. The bound, v there, and what it took in passes.
     """
-    best, passes, rest = math.inf, 0.0, 0.0
+    best, passes, rest, stalled, before = math.inf, 0.0, 0.0, 0, math.inf
     if side.later is not None:
         rest = _settled(side.later, _PAID * abs(largest_at_start(side, starts)[0]))
         side.propose()
@@ -272,8 +295,10 @@ def refined(
             bound = value + (left + rest + missing) * (1 + 1e-9) + 1e-15
             best = min(best, bound)
             side.remember(value, bound)
-            paid = left + rest + missing <= _PAID * abs(value)
-        if paid or hopeless or side.passes == _PASSES:
+            paid = left + rest + missing <= _PAID * abs(value) or best <= enough
+            stalled = stalled + 1 if side.steady and left + missing > _STALLED * before else 0
+            before = left + missing
+        if paid or hopeless or side.passes == _PASSES or stalled == 2:
             return best, value, passes
         side.correct(residuals)
         residuals = None

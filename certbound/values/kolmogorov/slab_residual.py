@@ -37,6 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import comb
 from typing import Any
 
@@ -45,6 +46,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.values.kolmogorov.cell_fields import Field
 from certbound.values.kolmogorov.factors import Factor
+from certbound.values.kolmogorov.images import Images
 from certbound.values.kolmogorov.splines import (
     DEGREE,
     ROUNDOFF,
@@ -61,7 +63,7 @@ from certbound.values.kolmogorov.splines import (
 _UP = 1 + 1e-11
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Generator:
     """L = f . D + tr(a D^2) / 2 on a grid: derivatives' orders, their coefficients, and the products they belong to.
 
@@ -86,6 +88,11 @@ class Generator:
                     if field is not None:
                         terms.append((plus(unit(i, n), unit(j, n)), field, 0.5 if i == j else 1.0, g))
         return cls(axes=axes, terms=tuple(terms), products=len(products))
+
+    @cached_property
+    def images(self) -> Images:
+        """The sum of the operators, for compiled loops."""
+        return Images.of(self.axes, [(orders, weight * field.lattice) for orders, field, weight, _ in self.terms])
 
     def at_lattice(self, coefficients: Array) -> Array:
         """v at the lattice points."""
@@ -125,9 +132,9 @@ class Generator:
         for i, axis in enumerate(self.axes):
             degree = axis.sampling.parts
             width = axis.widths.reshape([-1 if k == i else 1 for k in range(n)])
-            each = rates(unit(i, n, degree + 1))
+            each = rates(unit(i, n, degree + 1)) if degree < DEGREE else np.zeros(())
             for orders, field, weight, g in self.terms:
-                for k in range(degree + 1):
+                for k in range(len(field.slopes[i])):
                     higher = plus(orders, unit(i, n, degree + 1 - k))
                     if max(higher) <= DEGREE:
                         each = each + weight * large[g] * comb(degree + 1, k) * field.slopes[i][k] * sizes(higher)
@@ -161,8 +168,10 @@ class Sizes:
         if orders not in self.known:
             sums = []
             for group in self.groups:
-                sums.append(np.add.reduce([factor * part.size(orders)[rows] for part, rows, factor in group]))
-            self.known[orders] = np.maximum.reduce(sums) * (1 + 1e-13)
+                sizes = [(part.size(orders)[rows], factor) for part, rows, factor in group]
+                scaled = [one if isinstance(factor, float) and factor == 1.0 else factor * one for one, factor in sizes]
+                sums.append(scaled[0] if len(scaled) == 1 else np.add.reduce(scaled))
+            self.known[orders] = (sums[0] if len(sums) == 1 else np.maximum.reduce(sums)) * (1 + 1e-13)
         return self.known[orders]
 
 
@@ -209,7 +218,7 @@ def residual_bound(
     bulge, middle = _bulges(values, rates, h)
     parts = [Derivatives(generator.axes, one) for one in (*bulge, middle)]
     bends, turns = Sizes([[(one, _EVERY, 1.0)] for one in parts[:2]]), Sizes([[(parts[2], _EVERY, 1.0)]])
-    more = _most(_products(sketch, bulge, middle, factors), sketch.axes, True)  # whichever disturbance is best
+    more = _most_of_bulge(sketch, bulge, middle, factors)
     over = sketch.remainder(bends, turns, large, off) + sketch.roundoff(whole, speeds, 8 / h, large)
     bound = bound + np.maximum(more, 0.0) + over * _UP
     if clock is not None:
@@ -225,7 +234,7 @@ def rough_residual(
     h = steps.reshape(-1, *[1] * len(generator.axes))
     lines = _lines(generator, values, rates, factors, worst, proved=False)
     bulge, middle = _bulges(values, rates, h)
-    more = _most(_products(generator, bulge, middle, factors), generator.axes, True, proved=False)
+    more = _most_of_bulge(generator, bulge, middle, factors, proved=False)
     return np.asarray(lines + np.maximum(more, 0.0))
 
 
@@ -245,8 +254,7 @@ def most_at_knots(generator: Generator, values: Array, rates: Array, *, proved: 
     -------
     ndarray, shape (K, N_1, ...)
     """
-    _, images = generator.on_lattice(values)
-    bound = _most([[generator.at_lattice(rates) + np.add.reduce(images)]], generator.axes, True, proved)
+    bound = generator.images.most(values, rates, proved=proved)
     if not proved:
         return bound
     sizes, paces = (Sizes([[(Derivatives(generator.axes, one), _EVERY, 1.0)]]) for one in (values, rates))
@@ -279,17 +287,24 @@ def _bulges(values: Array, rates: Array, h: Array) -> tuple[list[Array], Array]:
     return [h / 3 * early, h / 3 * late], late - early
 
 
+def _most_of_bulge(
+    generator: Generator, bulge: list[Array], middle: Array, factors: Sequence[Factor | None], proved: bool = True
+) -> Array:  # fmt: skip
+    """The most of the bulge's interpolants on every cell of every slab, whichever disturbance is best."""
+    if all(one is None for one in factors):
+        return np.asarray(np.maximum(*(generator.images.most(one, middle, proved=proved) for one in bulge)))
+    return _most(_products(generator, bulge, middle, factors), generator.axes, True, proved)
+
+
 def _products(
     generator: Generator, bulge: list[Array], middle: Array, factors: Sequence[Factor | None]
 ) -> list[list[Array]]:  # fmt: skip
-    """Coefficients in time of the bulge of v_t + L v at lattice points: for all disturbances, or for each node."""
+    """Coefficients in time of the bulge of v_t + sum_g c_g L_g v at lattice points, for each disturbance's node."""
     _, first = generator.on_lattice(bulge[0])
     _, second = generator.on_lattice(bulge[1])
     pace = generator.at_lattice(middle)
     none = np.zeros_like(pace)
     shares = [[none, one, other, none] for one, other in zip(first, second)]
-    if all(one is None for one in factors):
-        return [[pace + np.add.reduce(first), pace + np.add.reduce(second)]]
     return _combined([none, pace, pace, none], shares, factors)
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import factorial
+from math import factorial, prod
 
 import numpy as np
 
@@ -124,7 +124,7 @@ def _combined(out, values, rows, stride):  # type: ignore[no-untyped-def]
 
 
 def _split(shape: tuple[int, ...], axis: int) -> tuple[int, int, int]:
-    return int(np.prod(shape[:axis])), shape[axis], int(np.prod(shape[axis + 1 :]))
+    return prod(shape[:axis]), shape[axis], prod(shape[axis + 1 :])
 
 
 def thin(array: Array, axis: int) -> Array:
@@ -183,7 +183,7 @@ class Sampling:
     Attributes
     ----------
     parts : int
-        Degree of the interpolant, 2 to 4.
+        Degree of the interpolant, 2 to 5.
     """
 
     parts: int
@@ -392,7 +392,8 @@ class Derivatives:
         if orders not in self.sizes:
             value = np.abs(self.control(orders))
             for axis, order in enumerate(orders):
-                value = sliding_max(value, axis + 1, DEGREE + 1 - order)
+                if order < DEGREE:
+                    value = sliding_max(value, axis + 1, DEGREE + 1 - order)
             if any(orders):
                 factors = [axis.rounding[order] for axis, order in zip(self.axes, orders)]
                 value += outer(factors) * _MANY * self.size((0,) * len(orders))

@@ -15,7 +15,7 @@ from certbound.values.kolmogorov.factors import Factor
 from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
 from certbound.values.kolmogorov.splines import Axis, Derivatives, Sampling, most_on_cells
 
-PARTS = (2, 3, 4)
+PARTS = (2, 3, 4, 5)
 
 
 def axis(rng: np.random.Generator, cells: int, parts: int, low: float = -1.0, high: float = 1.5) -> Axis:

@@ -27,7 +27,7 @@ _SECOND = (6 * GAMMA**2 - 20 * GAMMA + 5) / 4
 Stencils = Sequence[tuple[int, int]]
 DRIFT: Stencils = ((-2, 3), (-1, 2))
 """Upwind, where the drift is positive: of fifth order, of third where that does not fit or little noise smooths."""
-_SOLVED, _ITERATIONS = 1e-2, 30  # relative residual at which a system counts as solved; iterations at most
+_SOLVED, _ITERATIONS = 3e-3, 30  # relative residual at which a system counts as solved; iterations at most
 _WINDOW = 5  # nodes of the widest of the differences of `SplitEquation`
 _PECLET = 10.0  # of drift times width to squared noise, beyond which differences of fifth order may grow
 NOISE: Stencils = ((-3, 3), (-2, 2))
@@ -180,7 +180,7 @@ class SplitEquation(_Stepped):
     order upwind, the tridiagonal systems along the lines of one axis after the other (line Gauss-Seidel): layers and
     strong drift across many cells are met by it, and what is smooth over many cells changes little within a step. A
     product of tridiagonal factors, once a step, would do where a step moves nothing by more than a cell or so; where it
-    does, such a method hardly moves at all.
+    does, such a method hardly moves at all. Systems that follow each other have solutions near each other.
 
     Parameters
     ----------
@@ -191,6 +191,7 @@ class SplitEquation(_Stepped):
         self.nodes, self.shape, self.live = list(nodes), flow.shape[1:], ~dead
         self.rate = rate * self.live
         self.known: tuple[float, list[tuple[Array, Array, Array]]] = (0.0, [])
+        self.before: Array | None = None  # the last solution
         n = len(nodes)
         self.along: list[_Stencil] = []
         self.mixed: list[tuple[int, int, Banded, Banded, Array]] = []
@@ -245,8 +246,9 @@ class SplitEquation(_Stepped):
 
         size = values.size
         matrix, inverse = (sl.LinearOperator((size, size), matvec=one, dtype=float) for one in (applied, relaxed))
-        first = relaxed(values.ravel())
+        first = relaxed(values.ravel()) if self.before is None else self.before
         solution, _ = sl.bicgstab(matrix, values.ravel(), first, rtol=_SOLVED, maxiter=_ITERATIONS, M=inverse)
+        self.before = solution
         return np.asarray(solution).reshape(self.shape)
 
     def _lines(self, share: float) -> list[tuple[Array, Array, Array]]:

@@ -1,0 +1,321 @@
+"""v_t + L v on the lattice of one cell after another, and the most of its interpolants there: compiled loops.
+
+What `most_of_interpolants` says of arrays over all lattice points, for coefficients that do not change, without these
+arrays: a plane of points along the first axis is made at a time, and cells are bounded once the planes about them are
+there. Loops over points run innermost along the last axis, cell by cell for points with the same share of their cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from certbound.arrays import Array, Index
+from certbound.lazy import compiled
+from certbound.values.kolmogorov.splines import DEGREE, Axis
+
+_WINDOW = DEGREE + 1
+_NOTHING = np.zeros((0, 1))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Images:
+    """The generator as the loops read it, of two axes or three; a first axis of one point stands before two.
+
+    Attributes
+    ----------
+    starts : tuple of ndarray
+        First coefficient of each lattice point along the first two axes.
+    along : tuple of ndarray, shapes (3, L_i, W_i)
+        Weights of derivatives of orders 0 to 2 along these.
+    last : ndarray, shape (3, m + 1, 6, N_n)
+        The same along the last axis, by shares of cells.
+    pairs : ndarray, shape (C, 2)
+        Orders along the first two axes.
+    plain : ndarray, shape (3, C)
+        Constant coefficients, by the order along the last axis and the pair.
+    terms : ndarray, shape (T, 2)
+        Pairs and orders along the last axis, of the terms with other coefficients.
+    fields : ndarray, shape (T, L_1, L_2, m + 1, N_n)
+        These coefficients.
+    bends : tuple of ndarray
+        From values on a cell to the coefficients of minus the interpolant's second derivative, along each axis.
+    chords : ndarray, shape (3,)
+    """
+
+    starts: tuple[Index, Index]
+    along: tuple[Array, Array]
+    last: Array
+    pairs: Index
+    plain: Array
+    terms: Index
+    fields: Array
+    bends: tuple[Array, Array, Array]
+    chords: Array
+
+    @classmethod
+    def of(cls, axes: Sequence[Axis], terms: Sequence[tuple[tuple[int, ...], Array]]) -> Images:
+        """From the terms: orders of a derivative along the axes, and its coefficient at the lattice points."""
+        ahead = 3 - len(axes)
+        known: dict[tuple[int, int], int] = {(0, 0): 0}
+        places: list[tuple[int, int]] = []
+        for given, _ in terms:
+            first, second, third = (0,) * ahead + given
+            places.append((known.setdefault((first, second), len(known)), third))
+        plain, others, fields = np.zeros((3, len(known))), list[tuple[int, int]](), list[Array]()
+        shape = tuple(len(axis.lattice) for axis in axes)
+        for (pair, order), (_, given_field) in zip(places, terms):
+            coefficient = np.broadcast_to(given_field, shape)
+            if np.all(coefficient == coefficient.flat[0]):
+                plain[order, pair] += float(coefficient.flat[0])
+            else:
+                others.append((pair, order))
+                fields.append(_by_cells(coefficient.reshape((1,) * ahead + shape), axes[-1]))
+        both = [(np.zeros(1, dtype=np.intp), np.array([[[1.0]], [[0.0]], [[0.0]]]))] * ahead
+        both += [(axis.on_lattice[0].start, np.array([one.weights for one in axis.on_lattice])) for axis in axes]
+        bends = [_NOTHING] * ahead + [np.ascontiguousarray(-axis.sampling.derivative(2)) for axis in axes]
+        chords = [0.0] * ahead + [axis.sampling.chord for axis in axes]
+        parts, cells = axes[-1].sampling.parts, axes[-1].cells
+        points = _points(axes[-1])
+        last = np.zeros((3, parts + 1, _WINDOW, cells))
+        for derivative, banded in enumerate(axes[-1].on_lattice):
+            shift = banded.start[points] - np.arange(cells)  # a cell's last point is the next one's first
+            for k in range(_WINDOW):
+                place = k + shift
+                for p in range(parts + 1):
+                    fits = place[p] < _WINDOW  # of what does not, a spline that begins at a node, the weight is 0
+                    last[derivative, p, place[p][fits], np.flatnonzero(fits)] = banded.weights[points[p], k][fits]
+        return cls(
+            starts=(both[0][0], both[1][0]), along=(both[0][1], both[1][1]), last=last,
+            pairs=np.array(list(known), dtype=np.intp), plain=plain,
+            terms=np.array(others, dtype=np.intp).reshape(-1, 2),
+            fields=np.array(fields).reshape(len(fields), len(both[0][0]), len(both[1][0]), parts + 1, cells),
+            bends=(bends[0], bends[1], bends[2]), chords=np.array(chords),
+        )  # fmt: skip
+
+    def most(self, values: Array, rates: Array, *, proved: bool) -> Array:
+        """The most of the interpolants of rates + L values on every cell; or of the values at the lattice points.
+
+        Parameters
+        ----------
+        values, rates : ndarray, shape (K, N_1 + 5, ...)
+
+        Returns
+        -------
+        ndarray, shape (K, N_1, ...)
+        """
+        two = values.ndim == 3
+        given, pace = (np.ascontiguousarray(one[:, None] if two else one) for one in (values, rates))
+        parts = [len(one) + 1 if len(one) else 0 for one in self.bends]
+        counts = [max(len(start) - 1, 1) // max(m, 1) for start, m in zip(self.starts, parts)]
+        out = np.empty((len(given), *counts, self.last.shape[3]))
+        _most(
+            out, given, pace, *self.starts, *self.along, self.last, self.pairs, self.plain, self.terms, self.fields,
+            *self.bends, self.chords, proved,
+        )  # fmt: skip
+        return out[:, 0] if two else out
+
+
+def _points(axis: Axis) -> Index:
+    """Lattice points by shares of cells, shape (m + 1, N)."""
+    parts = axis.sampling.parts
+    return np.asarray(np.arange(axis.cells) * parts + np.arange(parts + 1)[:, None], dtype=np.intp)
+
+
+def _by_cells(coefficient: Array, axis: Axis) -> Array:
+    """Lattice values by shares of cells along the last axis."""
+    return np.asarray(coefficient[..., _points(axis)])
+
+
+@compiled
+def _most(  # type: ignore[no-untyped-def]
+    out, values, rates, start1, start2, along1, along2, last, pairs, plain, terms, fields, bend1, bend2, bend3,
+    chords, proved,
+):  # fmt: skip
+    """A plane of lattice points along the first axis after the other, and the cells between two nodes."""
+    parts1, parts2 = bend1.shape[0] + 1, bend2.shape[0] + 1
+    if bend1.shape[0] == 0:
+        parts1 = 0
+    points1, points2 = start1.size, start2.size
+    shares, cells = last.shape[1], last.shape[3]
+    shape = values.shape
+    first = np.empty((4, shape[2], shape[3]))
+    second = np.empty((pairs.shape[0] + 1, shape[3]))
+    mixed = np.empty((3, shape[3]))
+    used = np.zeros(3, np.bool_)
+    for o in range(3):
+        used[o] = np.any(plain[o] != 0.0)
+    used[0] = True
+    planes = np.empty((parts1 + 1, points2, shares, cells))
+    held = np.empty((parts1 + 1, points2, shares, cells))
+    dot = np.empty(cells)
+    rows, sums = np.empty((parts2 + 1, shares, cells)), np.empty((shares, cells))
+    line, plane, extra, best = np.empty(cells), np.empty(cells), np.empty(cells), np.empty(cells)
+    for k in range(shape[0]):
+        for p1 in range(points1):
+            _along_first(first, values[k], rates[k], start1[p1], along1[:, p1])
+            here = planes[p1 % (parts1 + 1)]
+            for p2 in range(points2):
+                _along_second(second, first, pairs, start2[p2], along2[:, p2])
+                for o in range(3):
+                    if used[o]:
+                        _mixed(mixed[o], second, plain[o], o == 0)
+                for s in range(shares):
+                    row = here[p2, s]
+                    row[:] = 0.0
+                    for o in range(3):
+                        if used[o]:
+                            _dotted(dot, last[o, s], mixed[o])
+                            for c in range(cells):
+                                row[c] += dot[c]
+                    for t in range(terms.shape[0]):
+                        _dotted(dot, last[terms[t, 1], s], second[terms[t, 0]])
+                        field = fields[t, p1, p2, s]
+                        for c in range(cells):
+                            row[c] += field[c] * dot[c]
+            if parts1 > 0 and (p1 == 0 or p1 % parts1 > 0):
+                continue
+            begin = p1 - parts1
+            for a in range(parts1 + 1):
+                held[a] = planes[(begin + a) % (parts1 + 1)]
+            cell1 = begin // max(parts1, 1)
+            for cell2 in range(out.shape[2]):
+                own = held[:, cell2 * parts2 : (cell2 + 1) * parts2 + 1]
+                best[:] = -np.inf
+                for a in range(parts1 + 1):
+                    _most_of_plane(plane, own[a], bend2, bend3, chords, proved, line, extra, sums)
+                    for c in range(cells):
+                        best[c] = max(best[c], plane[c])
+                if proved and bend1.shape[0] > 0:
+                    over = out[k, cell1, cell2]
+                    over[:] = 0.0
+                    for b in range(bend1.shape[0]):
+                        rows[:] = 0.0
+                        for a in range(parts1 + 1):
+                            w = bend1[b, a]
+                            for q in range(parts2 + 1):
+                                for s in range(shares):
+                                    for c in range(cells):
+                                        rows[q, s, c] += w * own[a, q, s, c]
+                        _most_of_plane(plane, rows, bend2, bend3, chords, proved, line, extra, sums)
+                        for c in range(cells):
+                            over[c] = max(over[c], plane[c])
+                    for c in range(cells):
+                        best[c] += chords[0] * over[c]
+                for c in range(cells):
+                    out[k, cell1, cell2, c] = best[c]
+
+
+@compiled
+def _along_first(out, values, rates, start, weights):  # type: ignore[no-untyped-def]
+    """Derivatives of orders 0 to 2 along the first axis at one of its points, and the rates there."""
+    out[:] = 0.0
+    for k in range(weights.shape[1]):
+        for o in range(4):
+            w = weights[o, k] if o < 3 else weights[0, k]
+            if w == 0.0:
+                continue
+            given = values[start + k] if o < 3 else rates[start + k]
+            for j in range(given.shape[0]):
+                for m in range(given.shape[1]):
+                    out[o, j, m] += w * given[j, m]
+
+
+@compiled
+def _along_second(out, first, pairs, start, weights):  # type: ignore[no-untyped-def]
+    """The pairs of derivatives at a point of the first two axes; last, the rates there."""
+    for i in range(out.shape[0]):
+        if i < pairs.shape[0]:
+            given, order = first[pairs[i, 0]], pairs[i, 1]
+        else:
+            given, order = first[3], 0
+        row = out[i]
+        row[:] = 0.0
+        for k in range(weights.shape[1]):
+            w = weights[order, k]
+            other = given[start + k]
+            for m in range(row.size):
+                row[m] += w * other[m]
+
+
+@compiled
+def _mixed(out, second, plain, with_rates):  # type: ignore[no-untyped-def]
+    """The sum of the pairs with constant coefficients, and of the rates."""
+    out[:] = 0.0
+    for i in range(plain.size):
+        if plain[i] != 0.0:
+            for m in range(out.size):
+                out[m] += plain[i] * second[i, m]
+    if with_rates:
+        rates = second[plain.size]
+        for m in range(out.size):
+            out[m] += rates[m]
+
+
+@compiled
+def _dotted(out, weights, values):  # type: ignore[no-untyped-def]
+    """out[c] = sum_m weights[m, c] values[c + m], of six."""
+    w0, w1, w2, w3, w4, w5 = weights[0], weights[1], weights[2], weights[3], weights[4], weights[5]
+    v0, v1, v2, v3, v4, v5 = values[0:], values[1:], values[2:], values[3:], values[4:], values[5:]
+    for c in range(out.size):
+        out[c] = (
+            w0[c] * v0[c] + w1[c] * v1[c] + w2[c] * v2[c] + w3[c] * v3[c] + w4[c] * v4[c] + w5[c] * v5[c]
+        )  # fmt: skip
+
+
+@compiled
+def _most_of_plane(out, plane, bend2, bend3, chords, proved, line, extra, sums):  # type: ignore[no-untyped-def]
+    """Bounds of the interpolants over the last two axes, of cells in a row."""
+    out[:] = -np.inf
+    for q in range(plane.shape[0]):
+        _most_of_line(line, plane[q], bend3, chords[2], proved)
+        for c in range(out.size):
+            out[c] = max(out[c], line[c])
+    if not proved:
+        return
+    extra[:] = 0.0
+    for b in range(bend2.shape[0]):
+        sums[:] = 0.0
+        for q in range(plane.shape[0]):
+            w = bend2[b, q]
+            for s in range(sums.shape[0]):
+                for c in range(out.size):
+                    sums[s, c] += w * plane[q, s, c]
+        _most_of_line(line, sums, bend3, chords[2], proved)
+        for c in range(out.size):
+            extra[c] = max(extra[c], line[c])
+    for c in range(out.size):
+        out[c] += chords[1] * extra[c]
+
+
+@compiled
+def _most_of_line(out, points, bend, chord, proved):  # type: ignore[no-untyped-def]
+    """Bounds of the interpolants along the last axis, of cells in a row."""
+    count = points.shape[0]
+    for c in range(out.size):
+        out[c] = points[0, c]
+    for s in range(1, count):
+        row = points[s]
+        for c in range(out.size):
+            out[c] = max(out[c], row[c])
+    if not proved:
+        return
+    if count == 5:
+        p0, p1, p2, p3, p4 = points[0], points[1], points[2], points[3], points[4]
+        for c in range(out.size):
+            more = 0.0
+            for b in range(3):
+                w = bend[b]
+                more = max(more, w[0] * p0[c] + w[1] * p1[c] + w[2] * p2[c] + w[3] * p3[c] + w[4] * p4[c])
+            out[c] += chord * more
+        return
+    for c in range(out.size):
+        more = 0.0
+        for b in range(bend.shape[0]):
+            total = 0.0
+            for s in range(count):
+                total += bend[b, s] * points[s, c]
+            more = max(more, total)
+        out[c] += chord * more
