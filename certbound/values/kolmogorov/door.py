@@ -107,9 +107,10 @@ def bound_failing(
     EnclosureError
         The model is undefined somewhere in the safe set.
     """
+    rate = RATE[_dimension(problem)]
     known = None if before is None else before.search
     search = known if known is not None and known.problem is problem and known.delta == delta else None
-    yield from (search or Search(problem, delta)).until(seconds * RATE[_dimension(problem)])
+    yield from (search or Search(problem, delta)).until(seconds * rate)
 
 
 def _dimension(problem: Problem) -> int:

@@ -125,3 +125,11 @@ def test_a_normal_start_without_variance_is_its_mean() -> None:
     starts = starts_in(sure)
     assert not starts.means
     assert np.array_equal(starts.low, [[0.2, -0.1]])
+
+
+def test_a_normal_start_is_on_no_side_of_an_obstacle() -> None:
+    system = cb.ContinuousSystem(lambda x: [-x], states=["x"], diffusion=[[0.3]])
+    start = cb.GaussianStart([0.0], [[0.01]])
+    problem = cb.Problem(system, initial=start, safe=[cb.Outside(cb.Box([1.0], [2.0]))], horizon=1.0, delta=0.1)
+    for engine in ("backward", "values"):
+        assert "defect" not in cb.verify_safety(problem, method=engine).reason
