@@ -529,6 +529,11 @@ class Side:
         """The most that v lacks at the end and at faces where paths can leave."""
         return max(float(self.shortfall_at_end().max()), *(float(missing.max()) for missing in self.shortfalls()))
 
+    def lift(self, share: float) -> None:
+        """Raise v from above by a share of itself: nothing is asked any more where it was nearly 1."""
+        for rows in (self.values, self.rates):
+            rows[:] = [(1 + share) * row for row in rows]
+
     def remember(self, value: float, bound: float) -> None:
         """Keep the coefficients as they are now where they prove more than before."""
         if self.best is None or bound < self.best.bound:  # later passes replace the arrays and do not change them

@@ -28,7 +28,8 @@ _PASSES, _USUAL = 12, 6  # at most, and in most cases
 _ROUGH, _CORRECTED = 0.4, 0.4  # a solution with a look at it, and one correction, in units of a pass that proves
 _WHOLE = _USUAL + _ROUGH + _CORRECTED  # what a grid takes
 _ROUNDS = (2, 1)  # grids whose axes are improved, at first and later on
-_STALLED = 0.7  # of what was left before: two passes that leave more are the last ones
+_STALLED = 0.7  # of what was left before: where a pass leaves more, v is lifted; two that do are the last ones
+_LIFT = 0.01  # of v, where failing is nearly sure: corners that no grid resolves leave residuals there
 _CLOSE = 1.01  # ratio of the bounds that ends the search
 _PAID = 0.005  # of the answer: what is left of the residual that need not be carried any more
 _ENOUGH = 0.97  # of the target: a bound that low may be written down with fewer digits
@@ -278,7 +279,7 @@ def refined(
     Passes end early once v at the start, which only grows, is beyond ``target``, or the bound is below ``enough``; the
     first ``residuals`` may be known. The bound, v there, and what it took in passes.
     """
-    best, passes, rest, stalled, before = math.inf, 0.0, 0.0, 0, math.inf
+    best, passes, rest, stalled, before, lifted = math.inf, 0.0, 0.0, 0, math.inf, False
     if side.later is not None:
         rest = _settled(side.later, _PAID * abs(largest_at_start(side, starts)[0]))
         side.propose()
@@ -301,6 +302,9 @@ def refined(
             before = left + missing
         if paid or hopeless or side.passes == _PASSES or stalled == 2:
             return best, value, passes
+        if stalled and side.above and not lifted:
+            side.lift(_LIFT)
+            lifted, before = True, math.inf
         side.correct(residuals)
         residuals = None
 
