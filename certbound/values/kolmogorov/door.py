@@ -129,6 +129,7 @@ class Search:
         self.setting = self.stages[0]
         self.starts, self.cell = starts_in(problem), _COARSEST[_dimension(problem)]
         self.lower, self.upper, self.work, self.cost, self.runs = 0.0, 1.0, 0.0, 0.0, 0
+        self.usual, self.proofs = 0.0, 0  # of the last grid: the work that its proofs take in most cases, and how many
         self.only = bool(problem.unknown) or self.setting.torn  # constants are no worst disturbance
         self.sides: tuple[bool, ...] = (True,) if self.only else (True, False)
         self.shapes: dict[bool, Shapes] = {}
@@ -145,8 +146,9 @@ class Search:
             if self.cost and not self._finer(budget):
                 return
             begun, self.runs = self.work, self.runs + 1
+            self.usual, self.proofs = 0.0, 0
             for above in self.sides:
-                side = self._side(above)
+                side = self._side(above) if self.runs == 1 else self._fitting(above, budget)
                 if self.runs == 1 and self.work - begun + _USUAL * side.work > budget:  # an upper bound at least
                     self.cost = self.work - begun
                     yield self._bounds(side, proved=self.work > 0)
@@ -157,6 +159,7 @@ class Search:
                 if above and len(self.sides) > 1 and self.estimate > _FAR * self.delta > 0:
                     continue
                 side = self._refined(side, budget)
+                self.usual, self.proofs = self.usual + _USUAL * side.work, self.proofs + 1
                 self.cost = self.work - begun
                 yield self._bounds(side)
                 if self.decided():
@@ -169,6 +172,18 @@ class Search:
         count = math.ceil(_STEPS / self.cell)
         return side_of(self.stages, self.cell, count, above, _scaled(self.shapes.get(above), self.cell))
 
+    def _fitting(self, above: bool, budget: float) -> Side:
+        """A side on a grid that what is left of the work about suffices for.
+
+        Grids of the two sides have axes of their own, so that one side's work says little of the other's.
+        """
+        side = self._side(above)
+        over = min(_USUAL * side.work / max(_LEAST * (budget - self.work), 1.0), _GROWTH)
+        if over <= 1.0:
+            return side
+        self.cell *= over ** (1 / (self.setting.dimension + 1))
+        return self._side(above)
+
     def _refined(self, side: Side, budget: float) -> Side:
         """Prove a bound on one grid, after better axes; the side on these."""
         above = side.above
@@ -179,7 +194,8 @@ class Search:
         target = math.inf if last or not self.delta else self.delta if above else -self.delta
         if residuals is not None:
             self.shapes[above] = (self.cell, better_shapes(side, residuals, self.starts.places))
-        bound, value, passes = refined(side, self.starts, target, residuals)
+        most = max((budget - self.work) / side.work, _USUAL)
+        bound, value, passes = refined(side, self.starts, target, residuals, most=most)
         self.work += (passes + _ROUGH * (1 + 2 * rounds)) * side.work
         self.kept += Witness.of(side)
         self.carried = abs(abs(value) - self.estimate)
@@ -193,12 +209,14 @@ class Search:
         """Choose the next grid by the work that is left; False where that is too little for one that is worth it."""
         dimension, delta = self.setting.dimension, self.delta
         growth = min(_GROWTH, (budget - self.work) / self.cost)
-        if growth < _LEAST:
+        fitting = (budget - self.work) / max(self.usual, 1.0)  # a proof that was given up soon cost less than the next
+        if growth < _LEAST or fitting < 1.0:
             return False
+        growth = min(growth, max(fitting, _LEAST))
         if delta > 0:
             room = _SHARE * abs(delta - self.estimate)
             needed = (self.carried / max(room, 1e-300)) ** ((dimension + 1) / _ORDER)
-            growth = min(max(min(growth, needed), _LEAST) * len(self.sides), _GROWTH)
+            growth = min(max(min(growth, needed), _LEAST) * max(self.proofs, 1), _GROWTH)
             self.sides = (self.estimate < delta or self.only,)
         self.cell /= growth ** (1 / (dimension + 1))
         return True
@@ -247,11 +265,13 @@ def side_of(
 
 
 def refined(
-    side: Side, starts: Starts, target: float = math.inf, residuals: list[Array] | None = None
+    side: Side, starts: Starts, target: float = math.inf, residuals: list[Array] | None = None, *,
+    most: float = math.inf,
 ) -> tuple[float, float, float]:  # fmt: skip
     """The bound of one side: passes of the carried error until what is left of the residual is paid.
 
-    Passes end early once v at the start, which only grows, is beyond ``target``; the first ``residuals`` may be known.
+    Passes end early once v at the start, which only grows, is beyond ``target``, or after ``most`` of them; the first
+    ``residuals`` may be known.
     The bound, v there, and what it took in passes.
     """
     best, passes, rest = math.inf, 0.0, 0.0
@@ -273,7 +293,7 @@ def refined(
             best = min(best, bound)
             side.remember(value, bound)
             paid = left + rest + missing <= _PAID * abs(value)
-        if paid or hopeless or side.passes == _PASSES:
+        if paid or hopeless or side.passes == _PASSES or passes >= most:
             return best, value, passes
         side.correct(residuals)
         residuals = None
