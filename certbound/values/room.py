@@ -139,6 +139,8 @@ def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float,
         low = min(faces[0])
     if 1 in faces:
         high = max(faces[1])
+    if problem.initial.random:
+        raise InfeasibleError(f"a random start lies on both sides of '{constraint.label}', as value functions see it.")
     around = problem.initial.hull()
     if around.hi[0] < low:
         return [(0, 1, constraint.inward(1, low), max(faces[0]))]

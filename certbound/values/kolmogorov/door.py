@@ -124,10 +124,10 @@ class Search:
     """
 
     def __init__(self, problem: Problem, delta: float) -> None:
-        self.problem, self.delta = problem, delta
+        self.problem, self.delta, self.cell = problem, delta, _COARSEST[_dimension(problem)]
         self.stages = stages_of(problem)
         self.setting = self.stages[0]
-        self.starts, self.cell = starts_in(problem), _COARSEST[_dimension(problem)]
+        self.starts = starts_in(problem)
         self.lower, self.upper, self.work, self.cost, self.runs = 0.0, 1.0, 0.0, 0.0, 0
         self.usual, self.proofs = 0.0, 0  # of the last grid: the work that its proofs take in most cases, and how many
         self.only = bool(problem.unknown) or self.setting.torn  # constants are no worst disturbance
