@@ -223,7 +223,8 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
     useful = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_delta < 0]
     yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
     known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
-    for name, row in ENGINES.items():
+    # on grids an engine does all the work that it may: those that soon say what they can come first
+    for name, row in sorted(ENGINES.items(), key=lambda item: item[1].dear and not item[1].soon):
         asked = verdict.answers.get(name)
         if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
             continue

@@ -139,13 +139,13 @@ def _beside(constraint: Inside, problem: Problem) -> list[tuple[int, int, float,
         low = min(faces[0])
     if 1 in faces:
         high = max(faces[1])
-    start = problem.initial
-    if not start.random:
-        around = start.hull()
-        if around.hi[0] < low:
-            return [(0, 1, constraint.inward(1, low), max(faces[0]))]
-        if around.lo[0] > high:
-            return [(0, 0, constraint.inward(0, high), min(faces[1]))]
+    if problem.initial.random:
+        raise InfeasibleError(f"a random start lies on both sides of '{constraint.label}', as value functions see it.")
+    around = problem.initial.hull()
+    if around.hi[0] < low:
+        return [(0, 1, constraint.inward(1, low), max(faces[0]))]
+    if around.lo[0] > high:
+        return [(0, 0, constraint.inward(0, high), min(faces[1]))]
     raise InfeasibleError(f"the starts must lie on one side of '{constraint.label}'.")
 
 

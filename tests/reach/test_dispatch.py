@@ -9,6 +9,7 @@ import certbound as cb
 from certbound.errors import EngineError, InfeasibleError
 from certbound.problem.library import MODELS
 from certbound.reach.contraction.local import local_constants, local_contraction_tube, local_tube, radius_over_pieces
+from certbound.reach.linear.run import LinearRun
 
 
 def spiral(half=0.05, sigma=0.05, horizon=2.0) -> cb.Problem:
@@ -47,6 +48,16 @@ def test_noise_widens_the_tube_and_carries_its_probability(method):
     directions = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     for t in (0.5, 1.0, 2.0):
         assert np.all(noisy.extent(directions, t) > calm.extent(directions, t))
+
+
+def test_a_tube_asks_no_probability_of_breaking_the_constraints(monkeypatch):
+    """Each of them asks for rows of its own, and for as much time as the tube itself."""
+    asked = []
+    monkeypatch.setattr(LinearRun, "_cell", lambda *given: asked.append(given))
+    problem = spiral().replace(safe=[cb.Inside(cb.Ball([0.0, 0.0], 9.0)), cb.Outside(cb.Ball([4.0, 4.0], 0.5))])
+    tube = cb.bound_reach(problem, method="linear")
+    assert tube.log10_delta <= np.log10(problem.delta) + 1e-9
+    assert not asked
 
 
 def test_auto_takes_an_engine_that_reaches_the_horizon():

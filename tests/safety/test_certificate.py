@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -215,6 +216,48 @@ def test_who_was_only_asked_for_a_certificate_is_asked_once_and_may_fail(monkeyp
         claim = certificate_data(small(), verdict, attempt=attempt)["claim"]
         assert claim == {"log10_delta": exact(-3.5), "method": "values", "assumptions": []}
     assert asked == ["barrier", "values"]
+
+
+def test_engines_on_grids_are_asked_for_a_certificate_after_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def refusing(*_: Any) -> Any:
+        raise CertificateError("not today.")
+
+    def silent(name: str) -> Any:
+        def prove(problem: cb.Problem) -> EngineAnswer:
+            asked.append(name)
+            return EngineAnswer(applicable=False, method=name)
+
+        return prove
+
+    verdict = verify_safety(small())
+    for name, row in ENGINES.items():
+        monkeypatch.setitem(ENGINES, name, replace(row, write=refusing, prove=silent(name)))
+    with pytest.raises(CertificateError, match="not today"):
+        certificate_data(small(), verdict)
+    assert asked == ["barrier", "quadratic", "backward", "values"]
+
+
+def test_a_proof_that_more_effort_writes_again_is_not_checked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked: list[Any] = []
+
+    def refuted(data: Any, *_: Any, **__: Any) -> Any:
+        checked.append(data)
+        return SimpleNamespace(valid=False, log10_proved=None, log10_lower_proved=None, reason="nothing holds.")
+
+    verdict = verify_safety(small(), method="linear")
+    row = ENGINES["linear"]
+    monkeypatch.setattr("certbound.checker.check_data", refuted)
+    monkeypatch.setitem(ENGINES, "linear", replace(row, write=lambda *_: ({"engine": "linear"}, -3.5, [])))
+    with pytest.raises(CertificateError, match="linear: nothing holds"):
+        proved_certificate(small(), verdict)
+    assert len(checked) == 1
+    other = replace(row, write=lambda *given: ({"engine": "linear"}, -3.5 + given[-1], []))
+    monkeypatch.setitem(ENGINES, "linear", other)
+    with pytest.raises(CertificateError, match="linear: nothing holds"):
+        proved_certificate(small(), verdict)
+    assert len(checked) > 2
 
 
 def test_a_certificate_that_proves_less_than_safe_is_written_again_with_more_effort() -> None:

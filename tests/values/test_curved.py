@@ -368,3 +368,15 @@ def test_residuals_where_u_is_low_are_paid_in_absolute_terms(
     )  # fmt: skip
     paid = near_walls.relative_payment(seen, flat, SMALL * (0.03 - 1), -SMALL, 1e-9)
     assert least <= math.exp(paid.log) < most
+
+
+def test_a_box_without_width_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No simulated path moves along the second state, which has no limits either."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.1 * np.eye(2))
+    wall = cb.Inside(cb.HalfSpace([1.0, 0.0], 1.0))
+    problem = cb.Problem(system, initial=[0.1, 0.2], safe=[wall], horizon=0.5)
+    still = (np.array([-1.0, 0.2]), np.array([1.0, 0.2]))
+    monkeypatch.setattr("certbound.values.continuous.curved.region.reach_of", lambda *_: still)
+    answer = values_engine(problem)
+    assert not answer.applicable
+    assert "no box of any width" in answer.reason

@@ -168,16 +168,18 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
     from certbound.safety.answers import is_at_most
     from certbound.safety.certificate import problem_data, restated
 
-    engine = reason = ""
+    engine = reason = text = ""
     best: tuple[float, str, str] | None = None
     for attempt in range(ATTEMPTS):
         try:
             with contained("certificate"):
-                text = verdict.certificate_text(problem, attempt=attempt)
+                before, text = text, verdict.certificate_text(problem, attempt=attempt)
         except EngineError as error:
             if attempt + 1 == ATTEMPTS and not engine:
                 raise
             reason = str(error)
+            continue
+        if text == before:  # of which the checker says the same
             continue
         poll("checking the certificate")
         begun = time.perf_counter()

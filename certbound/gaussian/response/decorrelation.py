@@ -23,7 +23,8 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 from certbound.watch import poll
 
-_BATCH = 2_000_000
+_BATCH = 1_000_000  # numbers of a batch of pairs
+_BESIDE = 100  # numbers that are made of a pair beside its matrix, for each state: rows, columns, and their products
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,7 +57,7 @@ class _Pairs:
 
 
 def _pairs(f: Array, phi: Array) -> Iterator[_Pairs]:
-    """All pairs, in batches of a few million numbers."""
+    """All pairs, in batches of a few million numbers with all that is made of them."""
     count, n = f.shape[:2]
     size = np.abs(f).sum(axis=2).max(axis=1) + n * phi
     matrix, error = np.zeros((0, n, n)), np.zeros(0)
@@ -70,7 +71,7 @@ def _pairs(f: Array, phi: Array) -> Iterator[_Pairs]:
         error = np.append(later, phi[b - 1])
         held.append((b, matrix, error))
         waiting += len(error)
-        if b == count or waiting * n * n > _BATCH:
+        if b == count or waiting * n * (n + _BESIDE) > _BATCH:
             yield _Pairs(
                 a=np.concatenate([np.arange(len(e)) for _, _, e in held]),
                 b=np.concatenate([np.full(len(e), k) for k, _, e in held]),

@@ -24,6 +24,7 @@ from certbound.gaussian.response.martingale_windows import (  # fmt: skip
     Course,
     Windows,
     inverse_of,
+    level_left,
     logsumexp,
     longer,
     one_cell,
@@ -247,7 +248,7 @@ class WindowEvent:
 
     def log_exceedance(self, levels: Array) -> float:
         """Upper bound of log P(exists t: rows[k] . Z_t > levels[k] on piece k, no coordinate above its level)."""
-        return self._log(levels - self.cost)
+        return self._log(level_left(levels, self.cost))
 
     def log_at_best(self, levels: Array) -> float:
         """What `log_exceedance` and `log_alone` cannot fall below: nothing lost to the coordinates (no bound)."""
@@ -267,6 +268,6 @@ class WindowEvent:
             return self._log(levels)
         factor = float(np.sqrt(2 * max(np.log(count) - log_share, 0.0)))
         lost = float(log_tail(factor)) + float(np.log(count)) + 1e-14
-        return logsumexp(np.array([lost, self._log(levels - self._cost(factor * sd))]))
+        return logsumexp(np.array([lost, self._log(level_left(levels, self._cost(factor * sd)))]))
 
 

@@ -28,6 +28,12 @@ def logsumexp(values: Array) -> float:
     return float(total + 4e-16 * (abs(top) + 1))
 
 
+def level_left(level: Array, cost: Array) -> Array:
+    """level - cost; an infinite level stays so, whatever it costs: nothing exceeds it."""
+    with np.errstate(invalid="ignore"):
+        return np.where(level == np.inf, np.inf, level - cost)
+
+
 def ratio_down(level: Array, variance_hi: Array) -> Array:
     """level / standard deviation, rounded down; +inf for a variance of 0 and a level that is not negative."""
     sd = np.sqrt(np.maximum(variance_hi, 0.0)) * ROUND

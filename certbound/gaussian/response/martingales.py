@@ -25,7 +25,7 @@ from certbound.arrays import Array, Index, Integers
 from certbound.gaussian.response.clocks import ClockEvents, SteadyEvent
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.linear_response import LinearResponse
-from certbound.gaussian.response.martingale_windows import logsumexp
+from certbound.gaussian.response.martingale_windows import level_left, logsumexp
 from certbound.gaussian.scalar import log_tail
 from certbound.rigor.intervals import Interval
 
@@ -127,7 +127,7 @@ class Martingales:
         return np.asarray(np.einsum("w...ki,ki->w...", losses, size) * _ROUND)
 
     def along(self, rows: Array) -> MartingaleEvent:
-        """The event along ``rows`` (N, n)."""
+        """The event along ``rows`` (N, n); its cost is infinite where no levels of the coordinates were found."""
         f = self.frame
         if self.silent:
             nothing = np.zeros(len(rows))
@@ -139,8 +139,10 @@ class Martingales:
         kappa, loss = self.variation(directions)
         off = np.abs(exact - directions[f.window]) + slack
         levels = self.coordinates
-        cost = np.einsum("ki,ki->k", off, levels[f.window]) + self._rounding(loss, levels)[f.window]
-        return MartingaleEvent(kappa=kappa, window=f.window, starts=f.starts, cost=cost * _ROUND)
+        with np.errstate(invalid="ignore"):
+            cost = np.einsum("ki,ki->k", off, levels[f.window]) + self._rounding(loss, levels)[f.window]
+        cost = np.where(np.isnan(cost), np.inf, cost * _ROUND)  # 0 times an infinite level
+        return MartingaleEvent(kappa=kappa, window=f.window, starts=f.starts, cost=cost)
 
 
 class Windowed:
@@ -231,7 +233,7 @@ class MartingaleEvent:
 
     def log_exceedance(self, levels: Array) -> float:
         """Upper bound of log P(exists t: rows[k] . M_t > levels[k] on piece k, no coordinate above its level)."""
-        room = np.minimum.reduceat(levels - self.cost * _ROUND, self.starts)
+        room = np.minimum.reduceat(level_left(levels, self.cost * _ROUND), self.starts)
         room = room - 4e-16 * np.abs(np.where(np.isfinite(room), room, 0.0))
         if np.any(room < 0):
             return 0.0
@@ -270,7 +272,7 @@ class SplitEvent:
         for less in _SPLITS:
             share = max(base - less, -1e8)
             part = self.martingale.level(share)
-            base = self.gaussian.log_exceedance(levels - part * _ROUND)
+            base = self.gaussian.log_exceedance(level_left(levels, part * _ROUND))
             if base >= 0.0:
                 break
             total = logsumexp(np.array([base, self.martingale.log_exceedance(part)]))

@@ -19,6 +19,9 @@ from certbound.errors import InfeasibleError
 from certbound.problem.model import Tape, arithmetic, compile_numpy
 from certbound.rigor.intervals import Interval, sqrt, stack
 
+_BALANCINGS = 8  # rounds that scale rows and columns
+_SMALL = 40  # bits by which an entry that rounding left is smaller than others
+
 
 @dataclass(frozen=True, eq=False)
 class Faces:
@@ -370,10 +373,43 @@ class Region:
 
 
 def linear_maximum(faces: Array, bounds: Array, direction: Array) -> float | None:
-    """max direction.x over {faces x <= bounds}: inf if unbounded, None if the set is empty."""
+    """max direction.x over {faces x <= bounds}: inf if unbounded, None if the set is empty.
+
+    It is asked in units of the faces' own, since the solver takes numbers below 1e-9 for 0 and 1e-7 for nothing.
+    """
     from scipy.optimize import linprog
 
-    result = linprog(-direction, A_ub=faces, b_ub=bounds, bounds=(None, None), method="highs")
+    rows, states = _balanced(faces, bounds)
+    cost = direction * states[:-1] / states[-1]
+    size = float(np.abs(cost).max(initial=0.0)) or 1.0
+    unit = np.where(np.any(faces != 0, axis=0), cost / size, np.sign(cost))  # without an end where no face has one
+    result = linprog(
+        -unit, A_ub=faces * rows[:, None] * states[:-1], b_ub=bounds * rows * states[-1], bounds=(None, None),
+        method="highs",
+    )  # fmt: skip
     if result.status == 2:
         return None
-    return -float(result.fun or 0.0) if result.status == 0 else np.inf
+    return -float(result.fun or 0.0) * size if result.status == 0 else np.inf
+
+
+def _balanced(faces: Array, bounds: Array) -> tuple[Array, Array]:
+    """Powers of 2 for the rows (m,) and columns (k + 1,) of (faces | bounds) that bring its entries near to 1.
+
+    In turn every row and every column is divided by the geometric mean of its least and its largest entry; then again
+    without entries that are still small in their row and their column, as those are that rounding left.
+    """
+    with np.errstate(divide="ignore"):
+        logs = np.log2(np.abs(np.column_stack([faces, bounds])))
+    used = logs > -np.inf
+    for _ in range(2):
+        low, high = np.where(used, logs, np.inf), np.where(used, logs, -np.inf)
+        free = ~used.any(axis=0)
+        low[:, free] = high[:, free] = 0.0
+        columns = np.zeros(logs.shape[1])
+        for _ in range(_BALANCINGS):
+            rows = -0.5 * ((low + columns)[:, ~free].min(axis=1) + (high + columns)[:, ~free].max(axis=1))
+            columns = -0.5 * ((low + rows[:, None]).min(axis=0) + (high + rows[:, None]).max(axis=0))
+            columns[free] = 0.0
+        scaled = high + rows[:, None] + columns
+        used &= (scaled >= scaled.max(axis=1, keepdims=True) - _SMALL) | (scaled >= scaled.max(axis=0) - _SMALL)
+    return np.exp2(np.rint(np.clip(rows, -500, 500))), np.exp2(np.rint(np.clip(columns, -500, 500)))

@@ -152,7 +152,7 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
         If the remainder feeds itself before the horizon ends, or no bound of the noise along some state was found.
     """
     run = run_of(problem, cells=cells, noise=noise)
-    outcome = run.probability(Share.of(problem.delta / 2), 2 if noise else 1)
+    outcome = run.bounded(Share.of(problem.delta / 2), 2 if noise else 1)
     answer = LinearAnswer(run=run, outcome=outcome, shown=outcome)
     if outcome.bounds is None:
         raise ArithmeticError(answer.reason)

@@ -164,6 +164,10 @@ class DiffusionRun(LinearRun):
 
     # ---- the fixed point ---------------------------------------------------------------------------------
 
+    def bounded(self, nonlinear: Share, effort: int = 2) -> Outcome:
+        """`probability`, which says by which reference."""
+        return self.probability(nonlinear, effort)
+
     def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(nonlinear.log), by the better of both references."""
         if nonlinear in self.outcomes:

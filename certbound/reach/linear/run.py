@@ -176,15 +176,20 @@ class LinearRun(Inclusion):
                 break
         return worst
 
-    def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
-        """Thm K7' with delta_N = exp(nonlinear.log): the outcome of the worst cell."""
+    def bounded(self, nonlinear: Share, effort: int = 2) -> Outcome:
+        """What `probability` rests on, for a tube: the limits are not asked for, and the probability is left 1."""
         bounds = None
         if not self.hopeless(nonlinear):
-            levels, events = self.levels(nonlinear)
-            bounds = self.include(levels, effort)
+            bounds = self.include(self.levels(nonlinear)[0], effort)
             self.lost = self.lost if bounds is not None else max(self.lost, nonlinear.log)
+        return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
+
+    def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
+        """Thm K7' with delta_N = exp(nonlinear.log): the outcome of the worst cell."""
+        found = self.bounded(nonlinear, effort)
+        bounds, events = found.bounds, [] if found.bounds is None else self.levels(nonlinear)[1]
         if bounds is None or not events:  # without events the noise-free reachable set alone
-            return Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
+            return found
         outcomes = [self._cell(cell, bounds, events[cell], nonlinear) for cell in range(self.engine.cells)]
         return max(outcomes, key=lambda outcome: outcome.log_probability)
 

@@ -264,7 +264,8 @@ def backward_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer
         return EngineAnswer(applicable=False, method="backward", reason=SPARED)
     from certbound.values.kolmogorov import Bounds, bound_failing
 
-    effort = asked.effort if asked.effort is not None else 1.0 if asked.thorough else _BRIEF
+    few = problem.system.dimension < 3  # in more states a part of the work proves nothing, and others say little
+    effort = asked.effort if asked.effort is not None else _BRIEF if few and not asked.thorough else 1.0
     answer = EngineAnswer(applicable=False, method="backward")
     try:
         before = asked.before if isinstance(asked.before, Bounds) else None

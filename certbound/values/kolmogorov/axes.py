@@ -113,7 +113,8 @@ def _face(setting: Setting, low: Array, high: Array, axis: int, place: float) ->
 
 def _layer(setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cell: float) -> float:
     inward = np.maximum((1 - 2 * side) * f, 1e-300)
-    width = float(np.min(a / (_LAYER * inward)))
+    with np.errstate(over="ignore"):  # no layer where the drift does not lead inward
+        width = float(np.min(a / (_LAYER * inward)))
     return max(min(width, cell), _SMALLEST * cell)
 
 

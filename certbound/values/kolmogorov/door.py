@@ -153,7 +153,7 @@ class Search:
                 return
             begun, self.runs, self.cost = self.work, self.runs + 1, 0.0
             for above in self.sides:
-                side = self._side(above)
+                side = self._side(above) if self.runs == 1 else self._fitting(above, budget)
                 self.cost += _WHOLE * side.work
                 if self.runs == 1 and self.work - begun + _WHOLE * side.work > budget:  # an upper bound at least
                     yield self._bounds(side, proved=self.work > 0)
@@ -163,7 +163,7 @@ class Search:
                     continue
                 last = _LEAST * self.cost > budget - self.work
                 if last or self._worth(side, budget):
-                    self._prove(side, last)
+                    self._prove(side, last, budget)
                     yield self._bounds(side)
                 if self.decided():
                     return
@@ -173,6 +173,18 @@ class Search:
     def _side(self, above: bool) -> Side:
         count = math.ceil(_STEPS / self.cell)
         return side_of(self.stages, self.cell, count, above, _scaled(self.shapes.get(above), self.cell))
+
+    def _fitting(self, above: bool, budget: float) -> Side:
+        """A side on a grid that what is left of the work about suffices for.
+
+        Grids of the two sides have axes of their own, so that one side's work says little of the other's.
+        """
+        side = self._side(above)
+        over = min(_WHOLE * side.work / max(_LEAST * (budget - self.work), 1.0), _GROWTH)
+        if over <= 1.0:
+            return side
+        self.cell *= over ** (1 / (self.setting.dimension + 1))
+        return self._side(above)
 
     def _solved(self, side: Side) -> Side:
         """Solve on one grid, or on better ones with as many cells; the side on these, once corrected."""
@@ -200,11 +212,12 @@ class Search:
         found = self.estimate + (1 if side.above else -1) * _PROVED * self.error
         return found <= self.delta if side.above else found > self.delta
 
-    def _prove(self, side: Side, last: bool) -> None:
+    def _prove(self, side: Side, last: bool, budget: float) -> None:
         above = side.above
         target = math.inf if last or not self.delta else self.delta if above else -self.delta
         enough = -math.inf if not self.delta else _ENOUGH * self.delta if above else -self.delta / _ENOUGH
-        bound, value, passes = refined(side, self.starts, target, enough=enough)
+        most = max((budget - self.work) / side.work, _USUAL)
+        bound, value, passes = refined(side, self.starts, target, enough=enough, most=most)
         self.work += passes * side.work
         self.kept += Witness.of(side)
         self.error = abs(abs(value) - self.estimate) / _PROVED
@@ -272,12 +285,12 @@ def side_of(
 
 def refined(
     side: Side, starts: Starts, target: float = math.inf, residuals: list[Array] | None = None, *,
-    enough: float = -math.inf,
+    enough: float = -math.inf, most: float = math.inf,
 ) -> tuple[float, float, float]:  # fmt: skip
     """The bound of one side: passes of the carried error until what is left of the residual is paid.
 
-    Passes end early once v at the start, which only grows, is beyond ``target``, or the bound is below ``enough``; the
-    first ``residuals`` may be known. The bound, v there, and what it took in passes.
+    Passes end early once v at the start, which only grows, is beyond ``target``, the bound is below ``enough``, or
+    ``most`` of them are made; the first ``residuals`` may be known. The bound, v there, and what it took in passes.
     """
     best, passes, rest, stalled, before, lifted = math.inf, 0.0, 0.0, 0, math.inf, False
     if side.later is not None:
@@ -300,7 +313,7 @@ def refined(
             paid = left + rest + missing <= _PAID * abs(value) or best <= enough
             stalled = stalled + 1 if side.steady and left + missing > _STALLED * before else 0
             before = left + missing
-        if paid or hopeless or side.passes == _PASSES or stalled == 2:
+        if paid or hopeless or side.passes == _PASSES or stalled == 2 or (passes >= most and math.isfinite(best)):
             return best, value, passes
         if stalled and side.above and not lifted:
             side.lift(_LIFT)

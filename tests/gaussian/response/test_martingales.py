@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from certbound.gaussian.response.events import WindowEvents
 from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
-from certbound.gaussian.response.martingales import MartingaleEvent, Martingales, Windowed, quantile
+from certbound.gaussian.response.martingales import MartingaleEvent, Martingales, SplitEvent, Windowed, quantile
 from certbound.rigor.intervals import Interval
 
 Array = NDArray[np.float64]
@@ -72,6 +73,37 @@ def test_every_window_costs_the_tail_of_a_reflected_brownian_motion() -> None:
     found = event.log_exceedance(np.full(6, 3.0))
     assert found == pytest.approx(np.log(2 * norm.sf(3.0) + 2 * norm.sf(6.0)), abs=1e-9)
     assert event.log_exceedance(event.level(-9.0)) <= -9.0
+
+
+def test_coordinates_without_levels_leave_no_level_that_is_finite() -> None:
+    """Units far apart: what rounding adds feeds itself, and the coordinates' levels are infinite."""
+    frame = Windowed(response(np.eye(2), 0.2, 20), 0)
+    frame.error = np.ones_like(frame.error)
+    found = Martingales(response(np.eye(2), 0.2, 20), 0, Interval(*np.full((2, 20, 2, 1), 0.5)), -9.0, frame)
+    assert np.all(np.isinf(found.coordinates))
+    event = found.along(np.broadcast_to([1.0, 0.0], (20, 2)))  # the second coordinate is off by 0
+    assert np.all(event.cost == np.inf)
+    assert np.all(event.level(-5.0) == np.inf)
+    assert event.log_exceedance(np.full(20, 1e9)) == 0.0
+
+
+def test_an_infinite_level_is_not_exceeded_whatever_it_costs() -> None:
+    cost = np.array([0.0, 0.0, 0.0, np.inf, np.inf, np.inf])
+    event = MartingaleEvent(
+        kappa=np.full(2, 0.1), window=np.repeat([0, 1], 3), starts=np.array([0, 3]), cost=cost
+    )
+    level = event.level(-9.0)
+    assert np.array_equal(np.isinf(level), np.isinf(cost))
+    assert event.log_exceedance(level) <= -9.0
+    slope = np.full((1, 6, 1, 1), -1.0)
+    base = continuous_response(slope, np.zeros_like(slope), 1 / 6, np.ones((1, 1)), np.zeros((1, 1)))
+    gaussian = WindowEvents(base, 0, 3, -9.0).along(np.ones((6, 1)))
+    split = SplitEvent(gaussian=gaussian, martingale=event)
+    assert split.log_exceedance(10 * level) < 0.0
+    assert split.log_exceedance(np.full(6, 1e9)) == 0.0
+    object.__setattr__(gaussian, "cost", cost)
+    assert gaussian.log_exceedance(10 * level) < 0.0
+    assert gaussian.log_exceedance(np.full(6, 1e9)) == 0.0
 
 
 def test_what_rows_lose_by_rounding_is_no_more_than_is_said() -> None:

@@ -197,3 +197,31 @@ def test_a_shape_is_symmetric_in_the_units_of_its_small_entries():
         shape = large + asymmetry * np.eye(3)[:, [0, 2, 1]] * [[0], [1], [0]]
         with pytest.raises(ValueError, match="must be symmetric") if refused else nullcontext():
             assert Ellipsoid([0, 0, 0], shape).shape[1, 2] == asymmetry / 2
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("room", [1.0, 1e-3])
+def test_a_polytope_is_the_same_in_units_far_apart(seed, room):
+    """Numbers of mixed units differ by many powers of ten, and none of them is too small to count."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 5))
+    faces = np.vstack([np.eye(n), -np.eye(n), np.round(rng.standard_normal((2, n)), 2)])
+    bounds = faces @ rng.standard_normal(n) + room * rng.random(len(faces))
+    units, sizes = 10.0 ** rng.uniform(-8, 8, n), 10.0 ** rng.uniform(-6, 6, len(faces))
+    turned = faces / units * sizes[:, None]
+    here, there = Polytope(faces, bounds), Polytope(turned, bounds * sizes)
+    directions = rng.standard_normal((6, n))
+    np.testing.assert_allclose(there.support(directions / units), here.support(directions), atol=1e-6 * room)
+    gap = np.append(bounds, -bounds[-1] - 1e-3 * room)  # beyond the last face
+    with pytest.raises(ValueError, match="got an empty one"):
+        Polytope(np.vstack([turned, -turned[-1]]), gap * np.append(sizes, sizes[-1]))
+
+
+def test_what_no_face_bounds_has_no_end():
+    assert Polytope([[0.0, 1e9]], [1e9]).support([[1e-9, 1.0], [0.0, 1.0]]).tolist() == [np.inf, 1.0]
+
+
+def test_entries_that_rounding_left_do_not_set_the_scale():
+    faces = np.vstack([np.eye(2), -np.eye(2)]) + np.array([[0, 6e-17], [6e-17, 0], [0, 0], [0, 0]])
+    square = Polytope(faces, [1.0, 2.0, 1e-17, 0.0])
+    np.testing.assert_allclose(square.support([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]), [1.0, 2.0, 0.0], atol=1e-12)

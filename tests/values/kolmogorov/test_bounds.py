@@ -12,9 +12,10 @@ from scipy.linalg import expm
 
 import certbound as cb
 from certbound.values.kolmogorov import bound_failing
+from certbound.values.kolmogorov.axes import _layer
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.door import largest_at_start, refined, starts_in
+from certbound.values.kolmogorov.door import RATE, largest_at_start, refined, starts_in
 from certbound.values.kolmogorov.face_exits import face_of
 
 SHARES = {"half": 0.5, "nothing": 0.0}
@@ -188,3 +189,30 @@ def test_a_second_search_goes_on_where_the_first_one_ended() -> None:
     assert list(bound_failing(problem, seconds=0.8, before=first)) == []
     other = next(bound_failing(problem.replace(horizon=1.9), seconds=0.8, before=first))
     assert other.runs == 1
+
+
+def test_a_search_does_about_as_much_work_as_it_was_given() -> None:
+    """A light swing: coarse grids are given up at once, which says nothing of what the next one takes."""
+    swing = cb.ContinuousSystem(
+        lambda x, v: [v, -9.12 * x - 0.29 * v], states=["x", "v"], diffusion=[[0.0], [0.1]]
+    )
+    box = cb.Box([-0.4, -1.0], [0.43, 1.05])
+    problem = cb.Problem(swing, initial=[-0.311, 0.0], safe=[cb.Inside(box)], horizon=5.0, delta=0.0131)
+    for seconds in (2.0, 4.0):
+        *_, found = bound_failing(problem, seconds=seconds, delta=problem.delta)
+        assert found.work <= 1.6 * seconds * RATE[2]
+
+
+def test_passes_end_where_the_work_does() -> None:
+    problem, truth = two_independent()
+    side = Side(stages_of(problem)[0], np.full(2, 0.1), 12, True)
+    side.propose()
+    bound, _, passes = refined(side, starts_in(problem), most=2.0)
+    assert 2.0 <= passes < 3.0
+    assert bound >= truth
+
+
+def test_numbers_of_any_size_plan_a_grid_without_a_warning() -> None:
+    """Where the drift leads outward there is no layer, however large the noise is in its units."""
+    outward, large = np.array([1.0, 2.0]), np.array([1e12, 1e12])
+    assert _layer(None, None, outward, large, 0, 1, 0.5) == 0.5

@@ -9,12 +9,13 @@ import pytest
 
 import certbound as cb
 from certbound.errors import InfeasibleError
-from certbound.values.kolmogorov import start_law
+from certbound.values.kolmogorov import bound_failing, start_law
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import refined, starts_in
 from certbound.values.kolmogorov.splines import Axis, Sampling
 from certbound.values.kolmogorov.start_law import StartMean, directions_of
+from certbound.values.room import limits_of
 
 COVARIANCES = {
     "independent": np.diag([0.04, 0.09]),
@@ -127,9 +128,12 @@ def test_a_normal_start_without_variance_is_its_mean() -> None:
     assert np.array_equal(starts.low, [[0.2, -0.1]])
 
 
-def test_a_normal_start_is_on_no_side_of_an_obstacle() -> None:
-    system = cb.ContinuousSystem(lambda x: [-x], states=["x"], diffusion=[[0.3]])
-    start = cb.GaussianStart([0.0], [[0.01]])
-    problem = cb.Problem(system, initial=start, safe=[cb.Outside(cb.Box([1.0], [2.0]))], horizon=1.0, delta=0.1)
-    for engine in ("backward", "values"):
-        assert "defect" not in cb.verify_safety(problem, method=engine).reason
+def test_one_state_is_refused_before_its_start_is_looked_at() -> None:
+    """A normal start beside an obstacle has no box around it, of which side it is on."""
+    system = cb.ContinuousSystem(lambda x: [-x[0]], states=1, diffusion=[[0.1]])
+    post = cb.Outside(cb.Box([1.0], [1.5]))
+    problem = cb.Problem(system, initial=cb.GaussianStart([0.0], [[0.01]]), safe=[post], horizon=1.0)
+    with pytest.raises(InfeasibleError, match="serve two and three states"):
+        next(iter(bound_failing(problem)))
+    with pytest.raises(InfeasibleError, match="random start lies on both sides of"):
+        limits_of(problem)

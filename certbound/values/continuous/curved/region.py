@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.errors import InfeasibleError
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Inside, Quadratic
 from certbound.values.continuous.curved.boundaries import Walls
@@ -67,7 +68,7 @@ def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) ->
     Raises
     ------
     InfeasibleError
-        Windows and moving sets.
+        Windows and moving sets; a box without width, where no path that was simulated moves along a state.
     """
     low, high = limits_around(problem)[0]
     around = [np.full(2, -np.inf), np.full(2, np.inf)]
@@ -89,6 +90,8 @@ def region_of(problem: Problem, drift: Floats, square: Floats, *, near: bool) ->
     found = [_clear(reach[side], ends, margin, sign) for side, sign in ((0, -1.0), (1, 1.0))]
     low = np.where(far[0], np.maximum(outer[0], found[0]), outer[0])
     high = np.where(far[1], np.minimum(outer[1], found[1]), outer[1])
+    if not np.all(low < high):
+        raise InfeasibleError("no box of any width was found around simulated paths; value functions prove nothing.")
     return Region(low=(float(low[0]), float(low[1])), high=(float(high[0]), float(high[1])), walls=Walls.of(walls))
 
 
