@@ -33,7 +33,8 @@ _GRANT = 0.7  # of the time that is left, where all of it may be spent: what doe
 _LEAST = 1e-3
 _FLOOR = -300.0
 _BACKWARD = 20.0  # of work, where it is asked alone
-_BRIEF = 0.4  # of that, where it is asked among others: for the rest once they prove nothing
+_BRIEF = (0.8, 0.4)  # of that, where it is asked among others, in three states and in two: for the rest once they
+# prove nothing; in three states less than that seldom proves anything
 _RATIO, _RATIO_WITH_EFFORT = 1.05, 1.0001  # of the two bounds below which grids are not refined
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
@@ -264,8 +265,8 @@ def backward_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer
         return EngineAnswer(applicable=False, method="backward", reason=SPARED)
     from certbound.values.kolmogorov import Bounds, bound_failing
 
-    few = problem.system.dimension < 3  # in more states a part of the work proves nothing, and others say little
-    effort = asked.effort if asked.effort is not None else _BRIEF if few and not asked.thorough else 1.0
+    brief = 1.0 if asked.thorough else _BRIEF[problem.system.dimension < 3]
+    effort = brief if asked.effort is None else asked.effort
     answer = EngineAnswer(applicable=False, method="backward")
     try:
         before = asked.before if isinstance(asked.before, Bounds) else None

@@ -24,10 +24,10 @@ from certbound.watch import poll
 
 _COARSEST = {2: 0.06, 3: .1}  # cell of the first grid, as a share of the range
 _STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
-_PASSES, _USUAL = 12, 6  # at most, and in most cases
+_PASSES, _USUAL = 12, 5  # at most, and in most cases
 _ROUGH, _CORRECTED = 0.4, 0.4  # a solution with a look at it, and one correction, in units of a pass that proves
 _WHOLE = _USUAL + _ROUGH + _CORRECTED  # what a grid takes
-_ROUNDS = (2, 1)  # grids whose axes are improved, at first and later on
+_ROUNDS = 2  # grids whose axes are improved, before the first one on which anything is proved
 _STALLED = 0.7  # of what was left before: where a pass leaves more, v is lifted; two that do are the last ones
 _LIFT = 0.01  # of v, where failing is nearly sure: corners that no grid resolves leave residuals there
 _CLOSE = 1.01  # ratio of the bounds that ends the search
@@ -41,7 +41,7 @@ _SHARE, _ORDER = 0.8, 3.0  # of what the target leaves, that an error may take; 
 _FAR = 2.0  # ratio of the coarsest solution to the target, beyond which it says which bound decides
 _FEWEST = 8  # steps of a stage
 _STARTS = 9  # points along each side of a start set
-RATE = {2: 1.8e5, 3: 1.1e5}
+RATE = {2: 1.8e5, 3: 9.0e4}
 """Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
 
 
@@ -162,7 +162,7 @@ class Search:
                 if above and len(self.sides) > 1 and self.estimate > _FAR * self.delta > 0:
                     continue
                 last = _LEAST * self.cost > budget - self.work
-                if last or self._worth(side, budget):
+                if self._worth(side, budget) or (last and not self._hopeless(side)):
                     self._prove(side, last, budget)
                     yield self._bounds(side)
                 if self.decided():
@@ -172,7 +172,8 @@ class Search:
 
     def _side(self, above: bool) -> Side:
         count = math.ceil(_STEPS / self.cell)
-        return side_of(self.stages, self.cell, count, above, _scaled(self.shapes.get(above), self.cell))
+        known = self.shapes.get(above) or self.shapes.get(not above)
+        return side_of(self.stages, self.cell, count, above, _scaled(known, self.cell))
 
     def _fitting(self, above: bool, budget: float) -> Side:
         """A side on a grid that what is left of the work about suffices for.
@@ -191,7 +192,7 @@ class Search:
         above = side.above
         for stage in side.stages[::-1]:
             stage.propose()
-        rounds = _ROUNDS[0 if above not in self.shapes else 1]
+        rounds = 0 if above in self.shapes or side.later is not None else 1 if self.shapes else _ROUNDS
         side, residuals = adapted(side, self.starts, rounds)
         value = largest_at_start(side, self.starts)[0]
         self.estimate, self.error = abs(value), math.inf
@@ -211,6 +212,11 @@ class Search:
             return True
         found = self.estimate + (1 if side.above else -1) * _PROVED * self.error
         return found <= self.delta if side.above else found > self.delta
+
+    def _hopeless(self, side: Side) -> bool:
+        """Whether a proof would say nothing: its work is of more use to others."""
+        found = self.estimate + (1 if side.above else -1) * self.error
+        return found >= 1 if side.above else found <= 0
 
     def _prove(self, side: Side, last: bool, budget: float) -> None:
         above = side.above

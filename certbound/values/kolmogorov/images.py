@@ -43,6 +43,8 @@ class Images:
     bends : tuple of ndarray
         From values on a cell to the coefficients of minus the interpolant's second derivative, along each axis.
     chords : ndarray, shape (3,)
+    order : tuple of int
+        The grid's axes as the loops take them: the one with most cells last.
     """
 
     starts: tuple[Index, Index]
@@ -54,10 +56,17 @@ class Images:
     fields: Array
     bends: tuple[Array, Array, Array]
     chords: Array
+    order: tuple[int, ...]
 
     @classmethod
     def of(cls, axes: Sequence[Axis], terms: Sequence[tuple[tuple[int, ...], Array]]) -> Images:
         """From the terms: orders of a derivative along the axes, and its coefficient at the lattice points."""
+        turn = tuple(sorted(range(len(axes)), key=lambda k: axes[k].cells))
+        shape = tuple(len(axis.lattice) for axis in axes)
+        terms = [
+            (tuple(orders[k] for k in turn), np.broadcast_to(given, shape).transpose(turn)) for orders, given in terms
+        ]
+        axes = [axes[k] for k in turn]
         ahead = 3 - len(axes)
         known: dict[tuple[int, int], int] = {(0, 0): 0}
         places: list[tuple[int, int]] = []
@@ -65,14 +74,12 @@ class Images:
             first, second, third = (0,) * ahead + given
             places.append((known.setdefault((first, second), len(known)), third))
         plain, others, fields = np.zeros((3, len(known))), list[tuple[int, int]](), list[Array]()
-        shape = tuple(len(axis.lattice) for axis in axes)
-        for (pair, order), (_, given_field) in zip(places, terms):
-            coefficient = np.broadcast_to(given_field, shape)
+        for (pair, order), (_, coefficient) in zip(places, terms):
             if np.all(coefficient == coefficient.flat[0]):
                 plain[order, pair] += float(coefficient.flat[0])
             else:
                 others.append((pair, order))
-                fields.append(_by_cells(coefficient.reshape((1,) * ahead + shape), axes[-1]))
+                fields.append(_by_cells(coefficient.reshape((1,) * ahead + coefficient.shape), axes[-1]))
         both = [(np.zeros(1, dtype=np.intp), np.array([[[1.0]], [[0.0]], [[0.0]]]))] * ahead
         both += [(axis.on_lattice[0].start, np.array([one.weights for one in axis.on_lattice])) for axis in axes]
         bends = [_NOTHING] * ahead + [np.ascontiguousarray(-axis.sampling.derivative(2)) for axis in axes]
@@ -92,7 +99,7 @@ class Images:
             pairs=np.array(list(known), dtype=np.intp), plain=plain,
             terms=np.array(others, dtype=np.intp).reshape(-1, 2),
             fields=np.array(fields).reshape(len(fields), len(both[0][0]), len(both[1][0]), parts + 1, cells),
-            bends=(bends[0], bends[1], bends[2]), chords=np.array(chords),
+            bends=(bends[0], bends[1], bends[2]), chords=np.array(chords), order=turn,
         )  # fmt: skip
 
     def most(self, values: Array, rates: Array, *, proved: bool) -> Array:
@@ -106,8 +113,11 @@ class Images:
         -------
         ndarray, shape (K, N_1, ...)
         """
-        two = values.ndim == 3
-        given, pace = (np.ascontiguousarray(one[:, None] if two else one) for one in (values, rates))
+        ahead = 3 - len(self.order)
+        turn = (0, *(k + 1 for k in self.order))
+        given, pace = (np.ascontiguousarray(one.transpose(turn)) for one in (values, rates))
+        for _ in range(ahead):
+            given, pace = given[:, None], pace[:, None]
         parts = [len(one) + 1 if len(one) else 0 for one in self.bends]
         counts = [max(len(start) - 1, 1) // max(m, 1) for start, m in zip(self.starts, parts)]
         out = np.empty((len(given), *counts, self.last.shape[3]))
@@ -115,7 +125,7 @@ class Images:
             out, given, pace, *self.starts, *self.along, self.last, self.pairs, self.plain, self.terms, self.fields,
             *self.bends, self.chords, proved,
         )  # fmt: skip
-        return out[:, 0] if two else out
+        return np.ascontiguousarray((out[:, 0] if ahead else out).transpose(np.argsort(turn)))
 
 
 def _points(axis: Axis) -> Index:
@@ -142,39 +152,30 @@ def _most(  # type: ignore[no-untyped-def]
     shares, cells = last.shape[1], last.shape[3]
     shape = values.shape
     first = np.empty((4, shape[2], shape[3]))
-    second = np.empty((pairs.shape[0] + 1, shape[3]))
-    mixed = np.empty((3, shape[3]))
+    second = np.empty((pairs.shape[0] + 1, points2, shape[3]))
+    mixed = np.empty((3, points2, shape[3]))
     used = np.zeros(3, np.bool_)
     for o in range(3):
         used[o] = np.any(plain[o] != 0.0)
     used[0] = True
     planes = np.empty((parts1 + 1, points2, shares, cells))
     held = np.empty((parts1 + 1, points2, shares, cells))
-    dot = np.empty(cells)
     rows, sums = np.empty((parts2 + 1, shares, cells)), np.empty((shares, cells))
-    line, plane, extra, best = np.empty(cells), np.empty(cells), np.empty(cells), np.empty(cells)
+    line, plane, extra, best, more = (
+        np.empty(cells), np.empty(cells), np.empty(cells), np.empty(cells), np.empty(cells)
+    )  # fmt: skip
     for k in range(shape[0]):
         for p1 in range(points1):
             _along_first(first, values[k], rates[k], start1[p1], along1[:, p1])
             here = planes[p1 % (parts1 + 1)]
-            for p2 in range(points2):
-                _along_second(second, first, pairs, start2[p2], along2[:, p2])
-                for o in range(3):
-                    if used[o]:
-                        _mixed(mixed[o], second, plain[o], o == 0)
-                for s in range(shares):
-                    row = here[p2, s]
-                    row[:] = 0.0
-                    for o in range(3):
-                        if used[o]:
-                            _dotted(dot, last[o, s], mixed[o])
-                            for c in range(cells):
-                                row[c] += dot[c]
-                    for t in range(terms.shape[0]):
-                        _dotted(dot, last[terms[t, 1], s], second[terms[t, 0]])
-                        field = fields[t, p1, p2, s]
-                        for c in range(cells):
-                            row[c] += field[c] * dot[c]
+            _along_second(second, first, pairs, start2, along2)
+            here[:] = 0.0
+            for o in range(3):
+                if used[o]:
+                    _mixed(mixed[o], second, plain[o], o == 0)
+                    _add_dots(here, last[o], mixed[o])
+            for t in range(terms.shape[0]):
+                _add_products(here, fields[t, p1], last[terms[t, 1]], second[terms[t, 0]])
             if parts1 > 0 and (p1 == 0 or p1 % parts1 > 0):
                 continue
             begin = p1 - parts1
@@ -185,7 +186,7 @@ def _most(  # type: ignore[no-untyped-def]
                 own = held[:, cell2 * parts2 : (cell2 + 1) * parts2 + 1]
                 best[:] = -np.inf
                 for a in range(parts1 + 1):
-                    _most_of_plane(plane, own[a], bend2, bend3, chords, proved, line, extra, sums)
+                    _most_of_plane(plane, own[a], bend2, bend3, chords, proved, line, more, extra, sums)
                     for c in range(cells):
                         best[c] = max(best[c], plane[c])
                 if proved and bend1.shape[0] > 0:
@@ -199,7 +200,7 @@ def _most(  # type: ignore[no-untyped-def]
                                 for s in range(shares):
                                     for c in range(cells):
                                         rows[q, s, c] += w * own[a, q, s, c]
-                        _most_of_plane(plane, rows, bend2, bend3, chords, proved, line, extra, sums)
+                        _most_of_plane(plane, rows, bend2, bend3, chords, proved, line, more, extra, sums)
                         for c in range(cells):
                             over[c] = max(over[c], plane[c])
                     for c in range(cells):
@@ -224,53 +225,66 @@ def _along_first(out, values, rates, start, weights):  # type: ignore[no-untyped
 
 
 @compiled
-def _along_second(out, first, pairs, start, weights):  # type: ignore[no-untyped-def]
-    """The pairs of derivatives at a point of the first two axes; last, the rates there."""
+def _along_second(out, first, pairs, starts, weights):  # type: ignore[no-untyped-def]
+    """The pairs of derivatives at the points of the second axis; last, the rates there."""
     for i in range(out.shape[0]):
-        if i < pairs.shape[0]:
-            given, order = first[pairs[i, 0]], pairs[i, 1]
-        else:
-            given, order = first[3], 0
-        row = out[i]
-        row[:] = 0.0
-        for k in range(weights.shape[1]):
-            w = weights[order, k]
-            other = given[start + k]
-            for m in range(row.size):
-                row[m] += w * other[m]
+        rates = i == pairs.shape[0]
+        given = first[3] if rates else first[pairs[i, 0]]
+        order = 0 if rates else pairs[i, 1]
+        for p in range(out.shape[1]):
+            start = starts[p]
+            for m in range(out.shape[2]):
+                out[i, p, m] = 0.0
+            for k in range(weights.shape[2]):
+                w = weights[order, p, k]
+                if w != 0.0:
+                    for m in range(out.shape[2]):
+                        out[i, p, m] += w * given[start + k, m]
 
 
 @compiled
 def _mixed(out, second, plain, with_rates):  # type: ignore[no-untyped-def]
     """The sum of the pairs with constant coefficients, and of the rates."""
     out[:] = 0.0
-    for i in range(plain.size):
-        if plain[i] != 0.0:
-            for m in range(out.size):
-                out[m] += plain[i] * second[i, m]
-    if with_rates:
-        rates = second[plain.size]
-        for m in range(out.size):
-            out[m] += rates[m]
+    for i in range(plain.size + 1):
+        w = plain[i] if i < plain.size else 1.0
+        if w == 0.0 or (i == plain.size and not with_rates):
+            continue
+        for p in range(out.shape[0]):
+            for m in range(out.shape[1]):
+                out[p, m] += w * second[i, p, m]
 
 
 @compiled
-def _dotted(out, weights, values):  # type: ignore[no-untyped-def]
-    """out[c] = sum_m weights[m, c] values[c + m], of six."""
-    w0, w1, w2, w3, w4, w5 = weights[0], weights[1], weights[2], weights[3], weights[4], weights[5]
-    v0, v1, v2, v3, v4, v5 = values[0:], values[1:], values[2:], values[3:], values[4:], values[5:]
-    for c in range(out.size):
-        out[c] = (
-            w0[c] * v0[c] + w1[c] * v1[c] + w2[c] * v2[c] + w3[c] * v3[c] + w4[c] * v4[c] + w5[c] * v5[c]
-        )  # fmt: skip
+def _add_dots(out, w, v):  # type: ignore[no-untyped-def]
+    """out[p, s, c] += sum_m w[s, m, c] v[p, c + m], of six."""
+    for p in range(out.shape[0]):
+        for s in range(out.shape[1]):
+            for c in range(out.shape[2]):
+                out[p, s, c] += (
+                    w[s, 0, c] * v[p, c] + w[s, 1, c] * v[p, c + 1] + w[s, 2, c] * v[p, c + 2]
+                    + w[s, 3, c] * v[p, c + 3] + w[s, 4, c] * v[p, c + 4] + w[s, 5, c] * v[p, c + 5]
+                )  # fmt: skip
 
 
 @compiled
-def _most_of_plane(out, plane, bend2, bend3, chords, proved, line, extra, sums):  # type: ignore[no-untyped-def]
+def _add_products(out, field, w, v):  # type: ignore[no-untyped-def]
+    """The same times coefficients."""
+    for p in range(out.shape[0]):
+        for s in range(out.shape[1]):
+            for c in range(out.shape[2]):
+                out[p, s, c] += field[p, s, c] * (
+                    w[s, 0, c] * v[p, c] + w[s, 1, c] * v[p, c + 1] + w[s, 2, c] * v[p, c + 2]
+                    + w[s, 3, c] * v[p, c + 3] + w[s, 4, c] * v[p, c + 4] + w[s, 5, c] * v[p, c + 5]
+                )  # fmt: skip
+
+
+@compiled
+def _most_of_plane(out, plane, bend2, bend3, chords, proved, line, more, extra, sums):  # type: ignore[no-untyped-def]
     """Bounds of the interpolants over the last two axes, of cells in a row."""
     out[:] = -np.inf
     for q in range(plane.shape[0]):
-        _most_of_line(line, plane[q], bend3, chords[2], proved)
+        _most_of_line(line, more, plane[q], bend3, chords[2], proved)
         for c in range(out.size):
             out[c] = max(out[c], line[c])
     if not proved:
@@ -283,7 +297,7 @@ def _most_of_plane(out, plane, bend2, bend3, chords, proved, line, extra, sums):
             for s in range(sums.shape[0]):
                 for c in range(out.size):
                     sums[s, c] += w * plane[q, s, c]
-        _most_of_line(line, sums, bend3, chords[2], proved)
+        _most_of_line(line, more, sums, bend3, chords[2], proved)
         for c in range(out.size):
             extra[c] = max(extra[c], line[c])
     for c in range(out.size):
@@ -291,7 +305,7 @@ def _most_of_plane(out, plane, bend2, bend3, chords, proved, line, extra, sums):
 
 
 @compiled
-def _most_of_line(out, points, bend, chord, proved):  # type: ignore[no-untyped-def]
+def _most_of_line(out, more, points, bend, chord, proved):  # type: ignore[no-untyped-def]
     """Bounds of the interpolants along the last axis, of cells in a row."""
     count = points.shape[0]
     for c in range(out.size):
@@ -302,20 +316,27 @@ def _most_of_line(out, points, bend, chord, proved):  # type: ignore[no-untyped-
             out[c] = max(out[c], row[c])
     if not proved:
         return
-    if count == 5:
-        p0, p1, p2, p3, p4 = points[0], points[1], points[2], points[3], points[4]
-        for c in range(out.size):
-            more = 0.0
-            for b in range(3):
-                w = bend[b]
-                more = max(more, w[0] * p0[c] + w[1] * p1[c] + w[2] * p2[c] + w[3] * p3[c] + w[4] * p4[c])
-            out[c] += chord * more
-        return
     for c in range(out.size):
-        more = 0.0
-        for b in range(bend.shape[0]):
-            total = 0.0
-            for s in range(count):
-                total += bend[b, s] * points[s, c]
-            more = max(more, total)
-        out[c] += chord * more
+        more[c] = 0.0
+    for b in range(bend.shape[0]):
+        if count == 6:
+            w0, w1, w2, w3, w4, w5 = bend[b, 0], bend[b, 1], bend[b, 2], bend[b, 3], bend[b, 4], bend[b, 5]
+            for c in range(out.size):
+                total = (
+                    w0 * points[0, c] + w1 * points[1, c] + w2 * points[2, c] + w3 * points[3, c]
+                    + w4 * points[4, c] + w5 * points[5, c]
+                )  # fmt: skip
+                more[c] = max(more[c], total)
+        elif count == 4:
+            w0, w1, w2, w3 = bend[b, 0], bend[b, 1], bend[b, 2], bend[b, 3]
+            for c in range(out.size):
+                total = w0 * points[0, c] + w1 * points[1, c] + w2 * points[2, c] + w3 * points[3, c]
+                more[c] = max(more[c], total)
+        else:
+            for c in range(out.size):
+                total = 0.0
+                for s in range(count):
+                    total += bend[b, s] * points[s, c]
+                more[c] = max(more[c], total)
+    for c in range(out.size):
+        out[c] += chord * more[c]
