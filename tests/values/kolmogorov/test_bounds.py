@@ -216,3 +216,20 @@ def test_numbers_of_any_size_plan_a_grid_without_a_warning() -> None:
     """Where the drift leads outward there is no layer, however large the noise is in its units."""
     outward, large = np.array([1.0, 2.0]), np.array([1e12, 1e12])
     assert _layer(None, None, outward, large, 0, 1, 0.5) == 0.5
+
+
+def test_passes_contract_at_corners_that_paths_leave_within_a_small_part_of_a_step() -> None:
+    """A pendulum's lower bound: noise in the velocity alone, cells at the noise-free limits 1e-4 of the range."""
+    pendulum = cb.ContinuousSystem(
+        lambda x, v: [v, -np.sin(x) - 0.3 * v], states=["x", "v"], diffusion=[[0.0], [0.5]]
+    )
+    box = cb.Box([-1.5, -2.2], [1.5, 2.2])
+    problem = cb.Problem(pendulum, initial=[0.0, 0.0], safe=[cb.Inside(box)], horizon=4.0)
+    side = Side(stages_of(problem)[0], np.full(2, 0.06), 14, False)
+    side.propose()
+    left = []
+    for _ in range(9):
+        residuals = side.residuals(side.begun)
+        left.append(float(sum(h * r.max() for h, r in zip(side.steps, residuals))))
+        side.correct(residuals)
+    assert left[8] < 0.1 * left[6]

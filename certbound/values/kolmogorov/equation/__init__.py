@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from certbound.values.kolmogorov.equation.changing import ChangingEquation
 from certbound.values.kolmogorov.equation.solve import Discretised, discretised
-from certbound.values.kolmogorov.equation.sources import BREADTHS, at_knots, at_nodes
+from certbound.values.kolmogorov.equation.sources import BREADTHS, Breadth, at_knots, at_nodes
 
-__all__ = ["BREADTHS", "ChangingEquation", "Discretised", "at_knots", "at_nodes", "discretised"]
+__all__ = ["BREADTHS", "Breadth", "ChangingEquation", "Discretised", "at_knots", "at_nodes", "discretised"]
