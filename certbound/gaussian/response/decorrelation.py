@@ -23,8 +23,8 @@ from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
 from certbound.watch import poll
 
-_BATCH = 1_000_000  # numbers of a batch of pairs
-_BESIDE = 100  # numbers that are made of a pair beside its matrix, for each state: rows, columns, and their products
+BATCH = 1_000_000  # numbers of a batch of pairs
+BESIDE = 100  # numbers that are made of a pair beside its matrix, for each state: rows, columns, and their products
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,7 +56,7 @@ class _Pairs:
     error: Array
 
 
-def _pairs(f: Array, phi: Array) -> Iterator[_Pairs]:
+def pairs_of(f: Array, phi: Array) -> Iterator[_Pairs]:
     """All pairs, in batches of a few million numbers with all that is made of them."""
     count, n = f.shape[:2]
     size = np.abs(f).sum(axis=2).max(axis=1) + n * phi
@@ -71,7 +71,7 @@ def _pairs(f: Array, phi: Array) -> Iterator[_Pairs]:
         error = np.append(later, phi[b - 1])
         held.append((b, matrix, error))
         waiting += len(error)
-        if b == count or waiting * n * (n + _BESIDE) > _BATCH:
+        if b == count or waiting * n * (n + BESIDE) > BATCH:
             yield _Pairs(
                 a=np.concatenate([np.arange(len(e)) for _, _, e in held]),
                 b=np.concatenate([np.full(len(e), k) for k, _, e in held]),
@@ -97,7 +97,7 @@ def decorrelation(r: LinearResponse, w: Array, diffusion: Array, first: int) -> 
     psi, convex = np.full((count + 1, count + 1), np.inf), np.zeros((count + 2, count + 2))
     side = np.zeros(count)
     rows = np.stack([x.middle for x in row.rows], axis=1), np.stack([x.radius for x in row.rows], axis=1)
-    for pairs in _pairs(r.transition[0, first:], r.transition_error[0, first:]):
+    for pairs in pairs_of(r.transition[0, first:], r.transition_error[0, first:]):
         psi[pairs.a, pairs.b] = _at_nodes(row, w, pairs)
         # the cell of parts a - 1 and b sees the pair of nodes a <= b; a = b is the neighbour
         inside = (pairs.a >= 1) & (pairs.b < count)

@@ -2,7 +2,7 @@
 
 The parts, each above those that it uses: ``splines`` (axes and their lattices), ``cell_fields`` (drift and noise on
 cells), ``products`` (time and disturbances apart from the states), ``factors`` (what they do within a slab),
-``slab_residual`` (the only trusted inequality), ``face_exits`` (what is asked of v at faces), ``box_setting`` (the
+``residual`` (the only trusted inequality), ``face_exits`` (what is asked of v at faces), ``box_setting`` (the
 problem), ``axes`` (graded nodes), ``solve`` and ``changing`` (untrusted numerics), ``carry`` (u, and the error that is
 carried), ``start_law`` (normal starts), ``door``.
 """

@@ -86,7 +86,8 @@ def _sizes(
             for time in setting.moments(i):
                 f, a = setting.flow(points, time)[i], setting.spread(points, time).reshape(n, n, *points.shape[1:])
                 if setting.noisy[i] and not shapes:
-                    sizes[i].append(_toward(place, _layer(setting, points, f, a[i, i], i, side, cell[i] * width[i])))
+                    most = cell[i] * width[i]
+                    sizes[i].append(_toward(place, layer_width(setting, points, f, a[i, i], i, side, most)))
                 elif not setting.noisy[i]:
                     grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place, time)
         for place in (setting.due_low[row, i], setting.due_high[row, i]):
@@ -111,7 +112,7 @@ def _face(setting: Setting, low: Array, high: Array, axis: int, place: float) ->
     return np.array([m.ravel() for m in np.meshgrid(*lines, indexing="ij")])
 
 
-def _layer(setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cell: float) -> float:
+def layer_width(setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cell: float) -> float:
     inward = np.maximum((1 - 2 * side) * f, 1e-300)
     with np.errstate(over="ignore"):  # no layer where the drift does not lead inward
         width = float(np.min(a / (_LAYER * inward)))

@@ -30,7 +30,7 @@ from certbound.values.kolmogorov.equation import (
 )
 from certbound.values.kolmogorov.face_exits import ALWAYS, Face, face_of, shortfall
 from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
-from certbound.values.kolmogorov.slab_residual import (
+from certbound.values.kolmogorov.residual import (
     Generator,
     most_at_knots,
     residual_bound,

@@ -148,8 +148,11 @@ class Search:
 
     def until(self, budget: float) -> Iterator[Bounds]:
         """Bounds, until so much work is done in all."""
+        silent: Side | None = None  # the last one that nothing was said of
         while not self.decided():
             if self.cost and not self._finer(budget):
+                if silent is not None:
+                    yield self._bounds(silent, proved=self.upper < 1 or self.lower > 0)
                 return
             begun, self.runs, self.cost = self.work, self.runs + 1, 0.0
             for above in self.sides:
@@ -158,12 +161,13 @@ class Search:
                 if self.runs == 1 and self.work - begun + _WHOLE * side.work > budget:  # an upper bound at least
                     yield self._bounds(side, proved=self.work > 0)
                     return
-                side = self._solved(side)
+                side = silent = self._solved(side)
                 if above and len(self.sides) > 1 and self.estimate > _FAR * self.delta > 0:
                     continue
                 last = _LEAST * self.cost > budget - self.work
                 if self._worth(side, budget) or (last and not self._hopeless(side)):
                     self._prove(side, last, budget)
+                    silent = None
                     yield self._bounds(side)
                 if self.decided():
                     return

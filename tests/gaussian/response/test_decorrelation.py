@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from certbound.gaussian.response.decorrelation import _BATCH, _BESIDE, _pairs, decorrelation
+from certbound.gaussian.response.decorrelation import BATCH, BESIDE, decorrelation, pairs_of
 from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
 from certbound.gaussian.response.moments import smooth_moments
 from certbound.gaussian.scalar.slepian import node_clock
@@ -128,7 +128,7 @@ def test_no_rates_where_the_variance_vanishes() -> None:
 @pytest.mark.parametrize("n", [1, 3])
 def test_pairs_of_nodes_come_in_batches_with_all_that_is_made_of_them(n: int) -> None:
     count = 300
-    batches = [len(pairs.a) for pairs in _pairs(np.tile(0.99 * np.eye(n), (count, 1, 1)), np.zeros(count))]
+    batches = [len(pairs.a) for pairs in pairs_of(np.tile(0.99 * np.eye(n), (count, 1, 1)), np.zeros(count))]
     assert sum(batches) == count * (count + 1) // 2
-    assert max(batches) * n * (n + _BESIDE) <= _BATCH + count * n * (n + _BESIDE)
+    assert max(batches) * n * (n + BESIDE) <= BATCH + count * n * (n + BESIDE)
     assert len(batches) > 3

@@ -8,8 +8,7 @@ import pytest
 from certbound.problem.model import trace
 from certbound.rigor.intervals import Interval
 from certbound.values.kolmogorov.cell_fields import Fields
-from certbound.values.kolmogorov.images import Images
-from certbound.values.kolmogorov.slab_residual import Generator
+from certbound.values.kolmogorov.residual import Generator, Images
 from certbound.values.kolmogorov.splines import Sampling, most_of_interpolants, over_cells
 from tests.values.kolmogorov.test_inequality import axis
 

@@ -12,7 +12,7 @@ from certbound.rigor.intervals import Interval
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.cell_fields import Fields
 from certbound.values.kolmogorov.factors import Factor
-from certbound.values.kolmogorov.slab_residual import Generator, residual_bound
+from certbound.values.kolmogorov.residual import Generator, residual_bound
 from certbound.values.kolmogorov.splines import Axis, Derivatives, Sampling, most_on_cells
 
 PARTS = (2, 3, 4, 5)

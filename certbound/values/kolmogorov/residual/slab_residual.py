@@ -46,7 +46,7 @@ import numpy as np
 from certbound.arrays import Array
 from certbound.values.kolmogorov.cell_fields import Field
 from certbound.values.kolmogorov.factors import Factor
-from certbound.values.kolmogorov.images import Images
+from certbound.values.kolmogorov.residual.images import Images
 from certbound.values.kolmogorov.splines import (
     DEGREE,
     ROUNDOFF,
