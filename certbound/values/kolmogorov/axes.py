@@ -113,6 +113,7 @@ def _face(setting: Setting, low: Array, high: Array, axis: int, place: float) ->
 
 
 def layer_width(setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cell: float) -> float:
+    """Width of a cell at a limit that noise crosses, at most ``cell``; ``f`` and ``a`` are those across it, there."""
     inward = np.maximum((1 - 2 * side) * f, 1e-300)
     with np.errstate(over="ignore"):  # no layer where the drift does not lead inward
         width = float(np.min(a / (_LAYER * inward)))

@@ -22,7 +22,7 @@ from certbound.values.kolmogorov.start_law import StartMean
 from certbound.values.kolmogorov.witness import Witness
 from certbound.watch import poll
 
-_COARSEST = {2: 0.06, 3: .1}  # cell of the first grid, as a share of the range
+_COARSEST = {2: 0.06, 3: 0.1}  # cell of the first grid, as a share of the range
 _STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
 _PASSES, _USUAL = 12, 5  # at most, and in most cases
 _ROUGH, _CORRECTED = 0.4, 0.4  # a solution with a look at it, and one correction, in units of a pass that proves

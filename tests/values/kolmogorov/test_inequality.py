@@ -212,3 +212,19 @@ def test_a_hump_that_no_line_of_the_lattice_shows_is_bounded_in_three_states() -
     seen = np.einsum("pa,pb,pc,abc->p", *weights, lattice)
     assert seen.max() > 1.03
     assert np.all(seen <= bound[0, 3, 3, 3])
+
+
+@pytest.mark.parametrize("parts", PARTS)
+def test_derivatives_of_a_coefficient_are_left_out_where_they_vanish_and_nowhere_else(parts: int) -> None:
+    """Of x^2 y, sin x and |x| y: the second order of a polynomial counts; none of a kink, whatever its tape says."""
+    rng = np.random.default_rng(parts)
+    axes = (axis(rng, 8, parts), axis(rng, 9, parts))
+    smooth = trace(lambda t, x: [x[0] ** 2 * x[1], np.sin(x[0])], {"t": ["t"], "x": ["x", "y"]})
+    square, wave = Fields(smooth, 2).on(axes, Interval(0.0, 1.0))
+    assert [len(rows) - 1 for rows in square.slopes] == [2, 1]
+    assert [len(rows) - 1 for rows in wave.slopes] == [parts, 0]
+    y = np.maximum(np.abs(axes[1].nodes[1:]), np.abs(axes[1].nodes[:-1]))
+    assert np.all(square.slopes[0][2] >= 2 * y * (1 - 1e-12))
+    bent = trace(lambda t, x: [abs(x[0]) * x[1]], {"t": ["t"], "x": ["x", "y"]})
+    (kink,) = Fields(bent, 2).on(axes, Interval(0.0, 1.0))
+    assert [len(rows) - 1 for rows in kink.slopes] == [parts, parts]
