@@ -20,8 +20,9 @@ from certbound.values.enclosing import enclose
 from certbound.values.kolmogorov.axes import Grazing, Plan, Size, plan_axes
 from certbound.values.kolmogorov.box_setting import Setting
 from certbound.values.kolmogorov.equation import (
+    ABOUT,
     BREADTHS,
-    Breadth,
+    SOLVED,
     ChangingEquation,
     Discretised,
     at_knots,
@@ -59,7 +60,7 @@ _KILL = 10.0
 _REACHED = 1.5
 _ON_FACE = 0.3  # of the source that would raise e to what v lacks while a path crosses one cell
 _BATCH = 300_000  # lattice points of the slabs that are looked at together
-_RESOLVED = 3.0  # of the flow against paths times the width of a cell to squared noise
+_FOLDS = 1.0, 3.0  # powers of e by which a solution may fall within a cell at a limit, and may not
 _MANY = 1.0  # log10 of the cells that paths leave within a step, from which on (to ten times as many) e is calm
 _SKETCH = 3  # degree of interpolants where little is at stake: of bulges, and where nothing is proved
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
@@ -146,11 +147,12 @@ def mesh_of(
     span: float,
     fresh: Mask,
     early: bool = False,
+    solved: float = SOLVED,
 ) -> Mesh:
     """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones.
 
     ``fresh``, shape (2, n), says which ends are none of the stage after this; ``early`` whether paths arrive in some
-    cells before the target, or in its first cells.
+    cells before the target, or in its first cells. Systems are ``solved`` to about that.
     """
     n = setting.dimension
     low, high = setting.low[row], setting.high[row]
@@ -169,9 +171,9 @@ def mesh_of(
             face = tuple(place if k == i else slice(None) for k in range(n))
             out = most[i][face] if side else -least[i][face]
             leaves = (noise[i, i][face] > 0) | (out >= 0)
+            gap = abs(lines[i][place] - lines[i][1 if side == 0 else -2])
+            resolved = 1 - _unresolved(-out, gap, noise[i, i][face]) if setting.noisy[i] else np.ones(leaves.shape)
             dead[face] |= leaves
-            against = -out * abs(lines[i][place] - lines[i][1 if side == 0 else -2])
-            resolved = ramp(2 - against / (_RESOLVED * noise[i, i][face] + 1e-300)) if setting.noisy[i] else 1.0
             at_limit[face] = np.maximum(at_limit[face], leaves * float(setting.limited[side, i]) * resolved)
             width = np.sqrt(max(noise[i, i][face].max(), 0.0) * span) or np.maximum(out, 0).mean() * span
             if not fresh[side, i]:
@@ -186,6 +188,8 @@ def mesh_of(
                 beyond = abs(lines[i][-1 if side else 0] - edge)
                 speed = size[i] / beyond + noise[i, i] / beyond**2
                 rate += _KILL * speed * ramp(out / beyond)
+            if kill and setting.noisy[i]:
+                rate += _softened(side, lines[i], points[i], (least, most)[side][i], noise[i, i])
     for one in grazing:
         edge = (low, high)[one.side][one.axis]
         out = (2 * one.side - 1) * (points[one.axis] - edge)
@@ -210,12 +214,32 @@ def mesh_of(
         falls *= 1 - there
     equation: Discretised | ChangingEquation = (
         ChangingEquation(lines, dead, rate, setting.noisy) if setting.changing
-        else discretised(lines, flow, spread, dead, rate)
+        else discretised(lines, flow, spread, dead, rate, solved)
     )  # fmt: skip
     return Mesh(
         nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, falls=falls, rate=rate,
         arrival=arrival, leaving=_leaving(lines, size, noise),
     )  # fmt: skip
+
+
+def _softened(side: int, line: Array, place: Array, flow: Array, noise: Array) -> Array:
+    """Killing within three cells of a limit whose layer these cells do not resolve: v rises over them instead.
+
+    Against paths the flow is so strong there that few come near; those who do are given up.
+    """
+    end, third, first = (line[-1], line[-4], line[-2]) if side else (line[0], line[3], line[1])
+    against = np.maximum(flow if side == 0 else -flow, 0)
+    within = ramp(1 - np.abs(place - end) / abs(end - third))
+    return np.asarray(_unresolved(against, abs(end - first), noise) * _KILL * against / abs(end - third) * within)
+
+
+def _unresolved(against: Array, gap: Array | float, noise: Array) -> Array:
+    """How little cells of width ``gap`` resolve the layer that flow against paths leaves at a limit, from 0 to 1.
+
+    Failing falls by e in it over noise / (2 flow).
+    """
+    folds = 2 * np.maximum(against, 0) * gap / (noise + 1e-300)
+    return ramp((folds - _FOLDS[0]) / (_FOLDS[1] - _FOLDS[0]))
 
 
 def _depth(target: Array, lines: tuple[Array, ...], points: Array) -> Array:
@@ -340,7 +364,7 @@ class Side:
         self.mesh = mesh_of(
             setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh, not above
         )
-        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh)
+        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh, solved=ABOUT)
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
         self.steps = time_steps(span * longer, steps, self.layer, _GROWTH[setting.dimension])
         self._follow_changes(int(np.ceil(setting.pace * steps)))
@@ -678,9 +702,7 @@ class Side:
             self._now(self.carrier, k + 1)
             found.append(e)
             speeds.append(equation.speed(e, ends[k + 1]))
-        if breadth is Breadth.ABOVE:
-            speeds = self._calmed(found, speeds)
-        for k, (e, speed) in enumerate(zip(found, speeds)):
+        for k, (e, speed) in enumerate(zip(found, self._calmed(found, speeds))):
             self._add(k, e, speed)
         self.passes += 1
 

@@ -100,7 +100,7 @@ def _indicators(side: Side, knot: int) -> list[Array]:
     result = []
     for i, axis in enumerate(side.axes):
         width = axis.widths.reshape([-1 if j == i else 1 for j in range(n)])
-        jumps = np.abs(np.diff(derivatives.control(unit(i, n, DEGREE))[0], axis=i))
+        jumps = np.abs(np.diff(derivatives.along(i, DEGREE)[0], axis=i))
         jumps = np.pad(jumps, [(3, 3) if j == i else (0, 0) for j in range(n)])
         jumps = sliding_max(jumps, i, 6)  # at the ends of an axis the splines have none
         for j in range(n):

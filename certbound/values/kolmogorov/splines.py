@@ -89,6 +89,73 @@ def _largest(out, values, count, stride):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _sizes(  # type: ignore[no-untyped-def]
+    out, coefficients, factors1, factors2, factors3, orders, degree, zero, off1, off2, off3
+):
+    """Of three axes: the largest magnitude of a derivative's control values on every cell, one spline at a time.
+
+    To it is added what it may be off: three factors, times the magnitude ``zero`` of the spline itself where known.
+    """
+    held = np.empty(coefficients.shape[1:])
+    n1, n2, n3 = held.shape
+    for number in range(coefficients.shape[0]):
+        held[:] = coefficients[number]
+        for o in range(orders[0]):
+            for i in range(n1 - 1 - o):
+                f, row, other = factors1[o, i], held[i], held[i + 1]
+                for j in range(n2):
+                    for k in range(n3):
+                        row[j, k] = f * (other[j, k] - row[j, k])
+        for i in range(n1 - orders[0]):
+            plane = held[i]
+            for o in range(orders[1]):
+                for j in range(n2 - 1 - o):
+                    f, line, behind = factors2[o, j], plane[j], plane[j + 1]
+                    for k in range(n3):
+                        line[k] = f * (behind[k] - line[k])
+            for j in range(n2 - orders[1]):
+                line = plane[j]
+                for o in range(orders[2]):
+                    for k in range(n3 - 1 - o):
+                        line[k] = factors3[o, k] * (line[k + 1] - line[k])
+                for k in range(n3 - orders[2]):
+                    line[k] = abs(line[k])
+                width, count = 1, degree[2] + 1 - orders[2]
+                while width < count:
+                    shift = min(width, count - width)
+                    for k in range(n3 - orders[2] - shift):
+                        line[k] = max(line[k], line[k + shift])
+                    width += shift
+            width, count = 1, degree[1] + 1 - orders[1]
+            while width < count:
+                shift = min(width, count - width)
+                for j in range(n2 - orders[1] - shift):
+                    line, behind = plane[j], plane[j + shift]
+                    for k in range(n3):
+                        line[k] = max(line[k], behind[k])
+                width += shift
+        width, count = 1, degree[0] + 1 - orders[0]
+        while width < count:
+            shift = min(width, count - width)
+            for i in range(n1 - orders[0] - shift):
+                row, other = held[i], held[i + shift]
+                for j in range(n2):
+                    for k in range(n3):
+                        row[j, k] = max(row[j, k], other[j, k])
+            width += shift
+        for i in range(out.shape[1]):
+            for j in range(out.shape[2]):
+                line, found = out[number, i, j], held[i, j]
+                if zero.shape[0] == 0:
+                    for k in range(line.size):
+                        line[k] = found[k]
+                else:
+                    off, own = off1[i] * off2[j], zero[number, i, j]
+                    for k in range(line.size):
+                        line[k] = found[k] + off * off3[k] * own[k]
+
+
+@compiled
 def _combined(out, values, rows, stride):  # type: ignore[no-untyped-def]
     """out[p, c, q] = the largest of 0 and sum_k rows[r, k] values[p, stride c + k, q] over r."""
     if values.shape[2] == 1:
@@ -308,18 +375,18 @@ class Axis:
         weights = np.einsum("jk,ckm->cjm", to_bernstein(count), full.reshape(self.cells, count, count))
         return Banded(place.astype(np.intp), np.ascontiguousarray(weights.reshape(-1, count)))
 
-    def differences(self, order: int) -> Banded:
-        """From control values of the (order - 1)-th derivative to those of the order-th."""
-        knots = self.knots[order : len(self.knots) - order]
-        degree = DEGREE - order
-        gaps = knots[degree + 1 :] - knots[: -degree - 1]
-        scale = (degree + 1) / gaps[: self.cells + degree]
-        return Banded(np.arange(len(scale)), np.ascontiguousarray(np.stack([-scale, scale], axis=1)))
-
     @cached_property
-    def differentiate(self) -> tuple[Banded, ...]:
-        """`differences` of orders 1 to 5."""
-        return tuple(self.differences(order) for order in range(1, DEGREE + 1))
+    def differentiate(self) -> Array:
+        """For orders 1 to 5: from differences of the derivative before to control values of this one, by factors.
+
+        Shape (5, N + 4); the later rows are shorter, and filled with zeros.
+        """
+        result = np.zeros((DEGREE, self.cells + DEGREE - 1))
+        for order in range(1, DEGREE + 1):
+            knots, degree = self.knots[order : len(self.knots) - order], DEGREE - order
+            gaps = knots[degree + 1 :] - knots[: -degree - 1]
+            result[order - 1, : self.cells + degree] = (degree + 1) / gaps[: self.cells + degree]
+        return result
 
     @cached_property
     def condition(self) -> tuple[Array, Array, Array]:
@@ -337,7 +404,7 @@ class Axis:
         """Per cell and order, how much larger than the coefficients the terms of a derivative's control values are."""
         result = [np.ones(self.cells)]
         for order, step in enumerate(self.differentiate, start=1):
-            largest = sliding_max(2.0 * step.weights[:, 1], 0, DEGREE + 1 - order)
+            largest = sliding_max(2.0 * step[: self.cells + DEGREE - order], 0, DEGREE + 1 - order)
             result.append(result[-1] * largest)
         return tuple(result)
 
@@ -364,7 +431,7 @@ def apply_dense(matrices: list[Array], values: Array) -> Array:
 
 
 class Derivatives:
-    """Control values of the partial derivatives of tensor splines, each computed once.
+    """Bounds of the partial derivatives of tensor splines in up to three variables, each computed once.
 
     Parameters
     ----------
@@ -374,31 +441,34 @@ class Derivatives:
     """
 
     def __init__(self, axes: tuple[Axis, ...], coefficients: Array) -> None:
-        self.axes = axes
-        self.controls = {(0,) * len(axes): coefficients}
+        self.axes, self.coefficients = axes, coefficients
         self.sizes: dict[tuple[int, ...], Array] = {}
 
-    def control(self, orders: tuple[int, ...]) -> Array:
-        """Control values of the derivative of these orders."""
-        if orders not in self.controls:
-            axis = max(range(len(orders)), key=lambda k: (orders[k] > 0, k))
-            lower = tuple(order - (k == axis) for k, order in enumerate(orders))
-            step = self.axes[axis].differentiate[orders[axis] - 1]
-            self.controls[orders] = step.along(self.control(lower), axis + 1)
-        return self.controls[orders]
-
     def size(self, orders: tuple[int, ...]) -> Array:
-        """A bound of the magnitude of that derivative on every cell, shape (B, N_1, ..., N_n)."""
+        """A bound of the magnitude of the derivative of these orders on every cell, shape (B, N_1, ..., N_n)."""
         if orders not in self.sizes:
-            value = np.abs(self.control(orders))
-            for axis, order in enumerate(orders):
-                if order < DEGREE:
-                    value = sliding_max(value, axis + 1, DEGREE + 1 - order)
-            if any(orders):
-                factors = [axis.rounding[order] for axis, order in zip(self.axes, orders)]
-                value += outer(factors) * _MANY * self.size((0,) * len(orders))
-            self.sizes[orders] = value
+            shape, ahead = self.coefficients.shape, 3 - len(self.axes)
+            given = np.ascontiguousarray(self.coefficients).reshape(shape[0], *[1] * ahead, *shape[1:])
+            out = np.empty((shape[0], *[1] * ahead, *cells_of(self.axes)))
+            first, second, third = [_NONE] * ahead + [axis.differentiate for axis in self.axes]
+            degrees = np.array([0] * ahead + [DEGREE] * len(self.axes))
+            p, q, r = [np.ones(1)] * ahead + [axis.rounding[order] for axis, order in zip(self.axes, orders)]
+            zero = self.size((0,) * len(orders)).reshape(out.shape) if any(orders) else out[:0]
+            times = np.array([0] * ahead + list(orders))
+            _sizes(out, given, first, second, third, times, degrees, zero, _MANY * p, q, r)
+            self.sizes[orders] = out.reshape(shape[0], *out.shape[ahead + 1 :])
         return self.sizes[orders]
+
+    def along(self, axis: int, order: int) -> Array:
+        """Control values of a derivative along one axis."""
+        value = self.coefficients
+        for row in self.axes[axis].differentiate[:order]:
+            value = np.diff(value, axis=axis + 1)
+            value *= row[: value.shape[axis + 1]].reshape([-1 if k == axis else 1 for k in range(len(self.axes))])
+        return value
+
+
+_NONE = np.zeros((0, 0))
 
 
 def most_on_cells(axes: tuple[Axis, ...], coefficients: Array) -> Array:

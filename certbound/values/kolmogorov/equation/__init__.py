@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from certbound.values.kolmogorov.equation.changing import ChangingEquation
-from certbound.values.kolmogorov.equation.solve import Discretised, discretised
+from certbound.values.kolmogorov.equation.solve import ABOUT, SOLVED, Discretised, discretised
 from certbound.values.kolmogorov.equation.sources import BREADTHS, Breadth, at_knots, at_nodes
 
-__all__ = ["BREADTHS", "Breadth", "ChangingEquation", "Discretised", "at_knots", "at_nodes", "discretised"]
+__all__ = [
+    "ABOUT", "BREADTHS", "SOLVED", "Breadth", "ChangingEquation", "Discretised", "at_knots", "at_nodes", "discretised",
+]  # fmt: skip

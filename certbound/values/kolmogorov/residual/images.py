@@ -161,9 +161,7 @@ def _most(  # type: ignore[no-untyped-def]
     planes = np.empty((parts1 + 1, points2, shares, cells))
     held = np.empty((parts1 + 1, points2, shares, cells))
     rows, sums = np.empty((parts2 + 1, shares, cells)), np.empty((shares, cells))
-    line, plane, extra, best, more = (
-        np.empty(cells), np.empty(cells), np.empty(cells), np.empty(cells), np.empty(cells)
-    )  # fmt: skip
+    over = np.empty(cells)
     for k in range(shape[0]):
         for p1 in range(points1):
             _along_first(first, values[k], rates[k], start1[p1], along1[:, p1])
@@ -184,29 +182,18 @@ def _most(  # type: ignore[no-untyped-def]
             cell1 = begin // max(parts1, 1)
             for cell2 in range(out.shape[2]):
                 own = held[:, cell2 * parts2 : (cell2 + 1) * parts2 + 1]
+                best = out[k, cell1, cell2]
                 best[:] = -np.inf
                 for a in range(parts1 + 1):
-                    _most_of_plane(plane, own[a], bend2, bend3, chords, proved, line, more, extra, sums)
-                    for c in range(cells):
-                        best[c] = max(best[c], plane[c])
+                    _most_of_plane(best, own[a], bend2, bend3, chords, proved, sums)
                 if proved and bend1.shape[0] > 0:
-                    over = out[k, cell1, cell2]
                     over[:] = 0.0
                     for b in range(bend1.shape[0]):
-                        rows[:] = 0.0
-                        for a in range(parts1 + 1):
-                            w = bend1[b, a]
-                            for q in range(parts2 + 1):
-                                for s in range(shares):
-                                    for c in range(cells):
-                                        rows[q, s, c] += w * own[a, q, s, c]
-                        _most_of_plane(plane, rows, bend2, bend3, chords, proved, line, more, extra, sums)
-                        for c in range(cells):
-                            over[c] = max(over[c], plane[c])
+                        for q in range(parts2 + 1):
+                            _sum_of(rows[q], own[:, q], bend1[b])
+                        _most_of_plane(over, rows, bend2, bend3, chords, proved, sums)
                     for c in range(cells):
                         best[c] += chords[0] * over[c]
-                for c in range(cells):
-                    out[k, cell1, cell2, c] = best[c]
 
 
 @compiled
@@ -280,63 +267,84 @@ def _add_products(out, field, w, v):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _most_of_plane(out, plane, bend2, bend3, chords, proved, line, more, extra, sums):  # type: ignore[no-untyped-def]
-    """Bounds of the interpolants over the last two axes, of cells in a row."""
-    out[:] = -np.inf
+def _most_of_plane(out, plane, bend2, bend3, chords, proved, sums):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to bounds of the interpolants over the last two axes, of cells in a row."""
+    best, extra = np.full(out.size, -np.inf), np.zeros(out.size)
     for q in range(plane.shape[0]):
-        _most_of_line(line, more, plane[q], bend3, chords[2], proved)
-        for c in range(out.size):
-            out[c] = max(out[c], line[c])
-    if not proved:
-        return
-    extra[:] = 0.0
-    for b in range(bend2.shape[0]):
-        sums[:] = 0.0
-        for q in range(plane.shape[0]):
-            w = bend2[b, q]
-            for s in range(sums.shape[0]):
-                for c in range(out.size):
-                    sums[s, c] += w * plane[q, s, c]
-        _most_of_line(line, more, sums, bend3, chords[2], proved)
-        for c in range(out.size):
-            extra[c] = max(extra[c], line[c])
+        _most_of_line(best, plane[q], bend3, chords[2], proved)
+    if proved:
+        for b in range(bend2.shape[0]):
+            _sum_of(sums, plane, bend2[b])
+            _most_of_line(extra, sums, bend3, chords[2], proved)
     for c in range(out.size):
-        out[c] += chords[1] * extra[c]
+        out[c] = max(out[c], best[c] + chords[1] * extra[c])
 
 
 @compiled
-def _most_of_line(out, more, points, bend, chord, proved):  # type: ignore[no-untyped-def]
-    """Bounds of the interpolants along the last axis, of cells in a row."""
-    count = points.shape[0]
-    for c in range(out.size):
-        out[c] = points[0, c]
-    for s in range(1, count):
-        row = points[s]
-        for c in range(out.size):
-            out[c] = max(out[c], row[c])
-    if not proved:
-        return
-    for c in range(out.size):
-        more[c] = 0.0
-    for b in range(bend.shape[0]):
-        if count == 6:
-            w0, w1, w2, w3, w4, w5 = bend[b, 0], bend[b, 1], bend[b, 2], bend[b, 3], bend[b, 4], bend[b, 5]
-            for c in range(out.size):
-                total = (
-                    w0 * points[0, c] + w1 * points[1, c] + w2 * points[2, c] + w3 * points[3, c]
-                    + w4 * points[4, c] + w5 * points[5, c]
+def _sum_of(out, rows, w):  # type: ignore[no-untyped-def]
+    """out = sum_q w[q] rows[q], of shares and cells."""
+    if w.size == 6:
+        for s in range(out.shape[0]):
+            for c in range(out.shape[1]):
+                out[s, c] = (
+                    w[0] * rows[0, s, c] + w[1] * rows[1, s, c] + w[2] * rows[2, s, c]
+                    + w[3] * rows[3, s, c] + w[4] * rows[4, s, c] + w[5] * rows[5, s, c]
                 )  # fmt: skip
-                more[c] = max(more[c], total)
-        elif count == 4:
-            w0, w1, w2, w3 = bend[b, 0], bend[b, 1], bend[b, 2], bend[b, 3]
-            for c in range(out.size):
-                total = w0 * points[0, c] + w1 * points[1, c] + w2 * points[2, c] + w3 * points[3, c]
-                more[c] = max(more[c], total)
-        else:
-            for c in range(out.size):
-                total = 0.0
-                for s in range(count):
-                    total += bend[b, s] * points[s, c]
-                more[c] = max(more[c], total)
-    for c in range(out.size):
-        out[c] += chord * more[c]
+        return
+    out[:] = 0.0
+    for q in range(w.size):
+        for s in range(out.shape[0]):
+            for c in range(out.shape[1]):
+                out[s, c] += w[q] * rows[q, s, c]
+
+
+@compiled
+def _most_of_line(out, points, bend, chord, proved):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to bounds of the interpolants along the last axis, of cells in a row."""
+    count = points.shape[0]
+    if proved and count == 6:
+        _most_of_six(out, points, bend, chord)
+    elif proved and count == 4:
+        _most_of_four(out, points, bend, chord)
+    else:
+        for c in range(out.size):
+            high, more = points[0, c], 0.0
+            for s in range(1, count):
+                high = max(high, points[s, c])
+            if proved:
+                for b in range(bend.shape[0]):
+                    total = 0.0
+                    for s in range(count):
+                        total += bend[b, s] * points[s, c]
+                    more = max(more, total)
+            out[c] = max(out[c], high + chord * more)
+
+
+@compiled
+def _most_of_six(out, p, bend, chord):  # type: ignore[no-untyped-def]
+    """`_most_of_line` of six points a cell, whose interpolants bend by four coefficients."""
+    a0, a1, a2, a3, a4, a5 = bend[0, 0], bend[0, 1], bend[0, 2], bend[0, 3], bend[0, 4], bend[0, 5]
+    b0, b1, b2, b3, b4, b5 = bend[1, 0], bend[1, 1], bend[1, 2], bend[1, 3], bend[1, 4], bend[1, 5]
+    c0, c1, c2, c3, c4, c5 = bend[2, 0], bend[2, 1], bend[2, 2], bend[2, 3], bend[2, 4], bend[2, 5]
+    d0, d1, d2, d3, d4, d5 = bend[3, 0], bend[3, 1], bend[3, 2], bend[3, 3], bend[3, 4], bend[3, 5]
+    for k in range(out.size):
+        u, v, w, x, y, z = p[0, k], p[1, k], p[2, k], p[3, k], p[4, k], p[5, k]
+        high = max(max(max(u, v), max(w, x)), max(y, z))
+        first = max(
+            a0 * u + a1 * v + a2 * w + a3 * x + a4 * y + a5 * z, b0 * u + b1 * v + b2 * w + b3 * x + b4 * y + b5 * z
+        )
+        second = max(
+            c0 * u + c1 * v + c2 * w + c3 * x + c4 * y + c5 * z, d0 * u + d1 * v + d2 * w + d3 * x + d4 * y + d5 * z
+        )
+        out[k] = max(out[k], high + chord * max(max(first, second), 0.0))
+
+
+@compiled
+def _most_of_four(out, p, bend, chord):  # type: ignore[no-untyped-def]
+    """The same of four points, and two coefficients."""
+    a0, a1, a2, a3 = bend[0, 0], bend[0, 1], bend[0, 2], bend[0, 3]
+    b0, b1, b2, b3 = bend[1, 0], bend[1, 1], bend[1, 2], bend[1, 3]
+    for k in range(out.size):
+        u, v, w, x = p[0, k], p[1, k], p[2, k], p[3, k]
+        more = max(a0 * u + a1 * v + a2 * w + a3 * x, b0 * u + b1 * v + b2 * w + b3 * x)
+        out[k] = max(out[k], max(max(u, v), max(w, x)) + chord * max(more, 0.0))
