@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -61,6 +61,11 @@ _REACHED = 1.5
 _ON_FACE = 0.3  # of the source that would raise e to what v lacks while a path crosses one cell
 _BATCH = 300_000  # lattice points of the slabs that are looked at together
 _FOLDS = 1.0, 3.0  # powers of e by which a solution may fall within a cell at a limit, and may not
+_CALM = {2: 3, 3: 1}
+"""Passes before the first one with a calm e, by the number of states. On the coarse grids of three states passes do not
+contract without (e of an epidemic .28 with, 4 without; Lorenz' lower bound .075, .16); on finer ones they do, and e is
+smaller then (a pendulum's .053, with calm ones .063)."""
+
 _MANY = 1.0  # log10 of the cells that paths leave within a step, from which on (to ten times as many) e is calm
 _SKETCH = 3  # degree of interpolants where little is at stake: of bulges, and where nothing is proved
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
@@ -188,8 +193,6 @@ def mesh_of(
                 beyond = abs(lines[i][-1 if side else 0] - edge)
                 speed = size[i] / beyond + noise[i, i] / beyond**2
                 rate += _KILL * speed * ramp(out / beyond)
-            if kill and setting.noisy[i]:
-                rate += _softened(side, lines[i], points[i], (least, most)[side][i], noise[i, i])
     for one in grazing:
         edge = (low, high)[one.side][one.axis]
         out = (2 * one.side - 1) * (points[one.axis] - edge)
@@ -220,17 +223,6 @@ def mesh_of(
         nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, falls=falls, rate=rate,
         arrival=arrival, leaving=_leaving(lines, size, noise),
     )  # fmt: skip
-
-
-def _softened(side: int, line: Array, place: Array, flow: Array, noise: Array) -> Array:
-    """Killing within three cells of a limit whose layer these cells do not resolve: v rises over them instead.
-
-    Against paths the flow is so strong there that few come near; those who do are given up.
-    """
-    end, third, first = (line[-1], line[-4], line[-2]) if side else (line[0], line[3], line[1])
-    against = np.maximum(flow if side == 0 else -flow, 0)
-    within = ramp(1 - np.abs(place - end) / abs(end - third))
-    return np.asarray(_unresolved(against, abs(end - first), noise) * _KILL * against / abs(end - third) * within)
 
 
 def _unresolved(against: Array, gap: Array | float, noise: Array) -> Array:
@@ -368,8 +360,6 @@ class Side:
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
         self.steps = time_steps(span * longer, steps, self.layer, _GROWTH[setting.dimension])
         self._follow_changes(int(np.ceil(setting.pace * steps)))
-        sketched = tuple(Axis(line, Sampling(_SKETCH)) for line in nodes)
-        self.generator, self.sketch = (_generator(setting, axes) for axes in (self.axes, sketched))
         self.maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.mesh.nodes)]
         self.carried_maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.carrier.nodes)]
         n, noisy = setting.dimension, setting.noisy
@@ -389,6 +379,16 @@ class Side:
         self.policy: list[Index | None] = []
         self.passes = 0
         self.best: Best | None = None
+
+    @cached_property
+    def generator(self) -> Generator:
+        """L on the axes."""
+        return _generator(self.setting, self.axes)
+
+    @cached_property
+    def sketch(self) -> Generator:
+        """The same with fewer points on a cell."""
+        return _generator(self.setting, tuple(Axis(axis.nodes, Sampling(_SKETCH)) for axis in self.axes))
 
     def follow(self, k: int) -> None:
         """Set the equation of the carried error to knot ``k``."""
@@ -649,7 +649,8 @@ class Side:
         many = max(1, _BATCH * len(self.steps) // (lattice * self.own_work))
         knots: Array | None = None
         same = all(one is None for one in self.factors)
-        if same:  # what the threads share
+        _ = (self.sketch, rough or self.generator)  # what the threads share
+        if same:
             _ = (self.sketch.images, rough or self.generator.images)
         with ThreadPoolExecutor(2) as pool:
             if not rough and same:
@@ -702,7 +703,9 @@ class Side:
             self._now(self.carrier, k + 1)
             found.append(e)
             speeds.append(equation.speed(e, ends[k + 1]))
-        for k, (e, speed) in enumerate(zip(found, self._calmed(found, speeds))):
+        if self.passes >= _CALM[self.setting.dimension]:
+            speeds = self._calmed(found, speeds)
+        for k, (e, speed) in enumerate(zip(found, speeds)):
             self._add(k, e, speed)
         self.passes += 1
 
