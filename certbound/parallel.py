@@ -75,8 +75,8 @@ def staff(work: Callable[..., Any], jobs: int, executor: Any = None) -> Iterator
     """Who calls one function with one task's arguments after the other's: the same answers whoever it is.
 
     Copies of this process that stay, ``jobs`` at a time, which are sent arguments and send answers back, both pickled;
-    or an executor, for which the function is pickled too. One process does all where there is one job, or where the
-    system cannot copy processes.
+    or an executor, for which the function is pickled too. One process does all where there is one job, or where it
+    cannot be copied.
     """
     found: Staff
     if executor is not None:
@@ -94,7 +94,8 @@ def staff(work: Callable[..., Any], jobs: int, executor: Any = None) -> Iterator
 
 
 def _can_copy() -> bool:
-    return "fork" in multiprocessing.get_all_start_methods()
+    """Whether this process may have copies: a worker of somebody's ``multiprocessing.Pool`` may not."""
+    return "fork" in multiprocessing.get_all_start_methods() and not multiprocessing.current_process().daemon
 
 
 def result_of(answer: Answer) -> Any:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import multiprocessing.context
 import os
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
@@ -19,7 +21,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import certbound as cb
 from certbound.errors import EngineError, SolverError
-from certbound.parallel import Answer, LostError, result_of, staff
+from certbound.parallel import Answer, LostError, crew, result_of, staff
 from certbound.watch import OutOfTime, Watch, poll
 from tests.reach.linear.test_bisection import flattening
 
@@ -199,6 +201,27 @@ def alive(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+def in_daemon(pipe: Any) -> None:
+    """The answers to a task with two jobs, and what a crew of one answers, in a process that may have no others."""
+    with crew(1) as workers:
+        workers.begin("one", os.getpid)
+        alone = workers.finished()
+    pipe.send((os.getpid(), [result_of(answer) for answer in asked(square, 3, 2)], alone))
+
+
+def test_a_daemonic_process_works_itself_as_it_may_have_no_copies() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads of others
+        process = multiprocessing.get_context("fork").Process(target=in_daemon, args=(theirs,), daemon=True)
+        process.start()
+    theirs.close()
+    assert ours.poll(30)
+    own, answers, found = ours.recv()
+    process.join()
+    assert answers == [(0, own), (1, own), (4, own)]
+    assert found == [("one", (own, None))]
 
 
 @pytest.mark.parametrize("jobs", [0, -1, 1.5])

@@ -118,11 +118,12 @@ class Program:
         until = time.monotonic() + _GRACE[0] + (1.0 + _GRACE[1]) * seconds  # nobody counts what a copy works
         with crew(1) as workers:  # one step of the solver may outlast the limit, and nothing in this process ends it
             workers.begin(0, lambda: self._solved(objective, matrix, right, seconds))
-            while time.monotonic() < until:
+            while True:
                 for _, answer in workers.finished():
                     return cast("Array | None", result_of(answer))
+                if time.monotonic() > until:
+                    return None
                 poll()
-        return None
 
     def _solved(self, objective: Array, matrix: Any, right: Array, seconds: float) -> Array | None:
         """What Clarabel finds."""

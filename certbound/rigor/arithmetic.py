@@ -69,6 +69,12 @@ class Interval:
         return cls._raw(array, array)
 
     @classmethod
+    def at_most(cls, value: ArrayLike) -> Interval:
+        """Degenerate intervals of bounds from above; of one that overflowed, [largest float, +inf]."""
+        array = np.asarray(value, dtype=np.float64)
+        return cls(np.minimum(array, LARGEST), array)
+
+    @classmethod
     @quiet
     def around(cls, mid: ArrayLike, rad: ArrayLike) -> Interval:
         """Intervals that contain mid - rad and mid + rad (rad >= 0, +inf allowed)."""

@@ -299,3 +299,12 @@ def test_set_operations_and_views():
     assert len(x) == 2
     assert "Interval" in repr(x)
     assert x.mig.tolist() == [0.0, 0.0]
+
+
+def test_bounds_that_overflowed_are_intervals_too():
+    found = Interval.at_most([2.0, np.inf, -3.0])
+    assert found.hi.tolist() == [2.0, np.inf, -3.0]
+    assert found.lo.tolist() == [2.0, np.finfo(float).max, -3.0]
+    assert (1.0 - found).lo[1] == -np.inf
+    with pytest.raises(ValueError, match="without NaN"):
+        Interval.at_most(np.nan)

@@ -11,9 +11,10 @@ from scipy.stats import norm
 
 import certbound as cb
 from certbound.errors import CertificateError, EngineError, InfeasibleError, contained
-from certbound.safety.answers import Request
+from certbound.safety.answers import EngineAnswer, Request
 from certbound.safety.certificate import problem_data
 from certbound.safety.portfolio import ENGINES
+from certbound.safety.verdict import verdict_of
 
 TIME = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=0.5)
 PLANE = cb.ContinuousSystem(lambda x: [x[1] - x[0], -x[0] - x[1]], states=["x", "y"], diffusion=0.3 * np.eye(2))
@@ -167,3 +168,27 @@ def test_what_is_not_served_is_unknown_and_says_what_would_work() -> None:
     found = cb.verify_safety(cb.Problem(TIME, initial=[0], safe=[jumps], horizon=2, delta=0.3))
     assert found.status == "UNKNOWN"
     assert "during" in found.reason
+
+
+def test_a_ball_that_rests_and_one_that_moves_are_not_brought_to_rest_by_turns(monkeypatch: Any) -> None:
+    searched: list[list[bool]] = []
+
+    def found(problem: cb.Problem, *_: Any, **__: Any) -> cb.Verdict:
+        searched.append([one.region.moving for one in problem.safe])
+        assert len(searched) < 9, "each ball is brought to rest by what lets another one move"
+        return verdict_of(problem, {"linear": EngineAnswer(applicable=False, reason="nothing.")}, "linear")
+
+    monkeypatch.setattr("certbound.safety.decision._searched", found)
+    swinging, resting = cb.Ball(lambda t: [0.1 * np.sin(t), 0.0], 0.5), cb.Ball([0.0, 0.0], 0.4)
+    problem = cb.Problem(PLANE, initial=[0, 0], safe=[cb.Inside(swinging), cb.Inside(resting)], horizon=2, delta=1e-9)
+    assert cb.verify_safety(problem).status == "UNKNOWN"
+    assert searched == [[True, False], [False, True]]
+    searched.clear()
+    falling_ball = cb.Ball(lambda t: [0.0, -0.1 * t], 0.6)
+    three = problem.replace(safe=[*problem.safe[:1], cb.Inside(falling_ball)])
+    assert cb.verify_safety(three).status == "UNKNOWN"
+    assert searched == [[True, True], [False, True], [True, False]]
+    searched.clear()
+    closing = cb.Ball(lambda t: [0.1 * np.sin(t), 0.0], lambda t: 0.5 - 0.1 * t)
+    assert cb.verify_safety(problem.replace(safe=[cb.Inside(closing), cb.Inside(resting)])).status == "UNKNOWN"
+    assert searched == 2 * [[False, True], [True, False]]  # from above and from below

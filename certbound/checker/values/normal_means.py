@@ -37,12 +37,13 @@ PER_DEVIATION = 3
 """Points of the mesh per standard deviation."""
 FARTHEST = 14.0
 """Standard deviations beyond which the density is counted as an error, below `_FAR` in all."""
-_FAR = 1e-30
+_FAR, _NOTHING = 1e-30, 17.0
+"""... and those beyond which N(0, 2) has less than that: Q(17/sqrt(2)) < 2e-33."""
 _TINY_BALL = arb(0, 1e-33)  # Q, and He_a phi for a < 8, beyond 15
 _UNIT = 2.0**-52
 _UP = 1 + 2.0**-30
 _FAR_PAIR, _NEAR_ENTRY = 30_000, 4_000
-"""Units of work of a point and an edge, and of every integral of a cell that lies near: 10 to 20 and 1 to 2 us."""
+"""Units of work of a point and an edge, and of every integral of a cell that lies near: 10 to 20 and 2 to 5 us."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +70,22 @@ class AxisTable:
 def axis_table(points: Array, edges: Array, deviation: arb, degree: int, budget: Budget) -> AxisTable:
     """The integrals of one axis for every point of the mesh and every cell, from balls."""
     shape = (len(points), len(edges) + 1)
-    pairs = math.prod(shape)
+    pairs, last = math.prod(shape), len(edges) - 1
     budget.take(8 * pairs * (ORDER * (degree + 1) + 1))
     budget.fits(8 * pairs * (2 * ORDER + degree + 1))
-    budget.balls(pairs, _FAR_PAIR)
+    budget.floats(2 * pairs, len(points))
+    reach = above(deviation) * _NOTHING
+    with np.errstate(over="ignore"):
+        spans = [np.searchsorted(edges - point, (-reach, reach)).tolist() for point in points]
+    spans = [(max(first - 1, 0), min(end, last)) for first, end in spans]
+    budget.balls(sum(end - first + 2 for first, end in spans), _FAR_PAIR)
     integrals, off = np.zeros((ORDER, degree + 1, *shape)), np.zeros((ORDER, *shape))
-    weight = np.zeros(shape)
-    exact, inverse = [arb(edge) for edge in edges], 1 / deviation
-    for j, point in enumerate(points):
-        row = [_at((edge - arb(float(point))) * inverse) for edge in exact]
-        row = [_Edge(None, arb(0), arb(0), []), *row, _Edge(None, arb(0), arb(0), [])]
-        for k, (left, right) in enumerate(pairwise(row)):
+    weight = np.full(shape, 2 * _FAR)
+    inverse, nowhere = 1 / deviation, _Edge(None, arb(0), arb(0), [])
+    for j, (point, (first, end)) in enumerate(zip(points, spans)):
+        row = [_at((arb(edge) - arb(float(point))) * inverse) for edge in edges[first : end + 1]]
+        row = [*[nowhere] * (first == 0), *row, *[nowhere] * (end == last)]
+        for k, (left, right) in enumerate(pairwise(row), first + (first > 0)):
             weight[j, k] = above(_mass(left, right, wide=True)) + _FAR
             if _is_near(left, right):
                 budget.balls(ORDER * (degree + 1), _NEAR_ENTRY)

@@ -13,6 +13,7 @@ import numpy as np
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
 from certbound.gaussian.response.linear_response import TINY, LinearResponse, gamma
+from certbound.rigor.rounding import quiet
 from certbound.watch import poll
 
 _MEMORY = 6 * 2**30  # bytes that the rows of one cell may take
@@ -25,7 +26,7 @@ class RowResponse:
     """Supports, along chosen rows, of states driven through the response of one cell.
 
     The state obeys s_{j+1} = F_j s_j + b_j. For rows r at nodes k the class gives bounds of r . s_k from the sets
-    of s_0 and b_j, by the adjoint rows of every earlier step.
+    of s_0 and b_j, by the adjoint rows of every earlier step. Where numbers overflow a bound is infinite, or no number.
 
     Parameters
     ----------
@@ -35,6 +36,7 @@ class RowResponse:
         States that b_j is expected to move; what it does to the others is bounded coarsely (all when omitted).
     """
 
+    @quiet
     def __init__(self, response: LinearResponse, cell: int, rows: Array, columns: Integers | None = None) -> None:
         self.nodes, asked, self.dimension = rows.shape
         n = self.dimension
@@ -105,6 +107,7 @@ class RowResponse:
             rows[j + 1 :, :, j, width:] = self.rest[j].reshape(steps - j, self.count, few)
         return rows.reshape(self.nodes * self.count, terms)
 
+    @quiet
     def errors(self, sizes: Array) -> Array:
         """Effect of the rounded adjoint rows for states with |s_j| <= ``sizes`` (N + 1, n): shape (M, D)."""
         steps = self.nodes - 1
@@ -112,6 +115,7 @@ class RowResponse:
         own = own + (self.error[:steps] * sizes[:steps].sum(axis=1))[:, None]
         return self._sizes(own * (1 + 1e-12) + TINY) * (1 + 1e-12)
 
+    @quiet
     def start(self, generators: Array) -> Array:
         """Support of the zonotope of ``generators`` (G, n) at node 0, carried to every node: shape (M, D)."""
         if not len(generators):
@@ -121,10 +125,12 @@ class RowResponse:
         size = (np.abs(self.initial) @ np.abs(generators.T)).sum(-1)
         return np.asarray(value + slack * size + TINY)[:, self.place]
 
+    @quiet
     def boxes(self, radii: Array) -> Array:
         """Support of the sum of the boxes |b_j| <= ``radii`` (N, n): shape (M, D)."""
         return np.asarray(self._sizes(radii) * (1 + gamma(2 * self.nodes + self.dimension) * 2 + 1e-12))
 
+    @quiet
     def centred(self, values: Array, radii: Array) -> tuple[Array, Array]:
         """The response to b_j = ``values`` (N, n), and the support of the boxes |b_j| <= ``radii`` around them.
 
@@ -139,6 +145,7 @@ class RowResponse:
                 rest * size[j, self.others].max() for j, rest in enumerate(self.rest)) * (1 + 1e-12)
         return total, slack
 
+    @quiet
     def segments(self, generators: Array) -> Array:
         """Support of the sum over j of the zonotopes of ``generators`` (N, G, n): shape (M, D)."""
 

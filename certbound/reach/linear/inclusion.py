@@ -12,6 +12,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.gaussian.response import LinearResponse, RowResponse
+from certbound.rigor.rounding import quiet
 
 _ROUND = 1 + 1e-13
 _UNIT = 2.0**-53
@@ -69,6 +70,8 @@ def gathering_of(
 class Supports:
     """Bounds of y and R of one cell along ``rows`` over every piece (and along the coordinates at every node).
 
+    Where numbers overflow the bounds are infinite.
+
     Parameters
     ----------
     gathering : Gathering
@@ -81,6 +84,7 @@ class Supports:
         States that the remainder or the disturbance moves by more than a rounding error (discrete time).
     """
 
+    @quiet
     def __init__(
         self, response: LinearResponse, gathering: Gathering, cell: int, rows: Array, generators: Array,
         *, continuous: bool, outputs: Integers | None = None,
@@ -110,6 +114,8 @@ class Supports:
         sizes = 1.001 * reach + 1e-290
         for _ in range(20):
             error = self.response.errors(sizes)
+            if not np.isfinite(error[:, : self.n]).all():
+                break
             if np.all(reach + error[:, : self.n] <= sizes):
                 return lower - error, upper + error
             sizes = 2 * (reach + error[:, : self.n])
@@ -120,7 +126,7 @@ class Supports:
         n, count = self.n, self.count
         start = slice(n, n + count)
         if not self.continuous:
-            return lower[: len(self.rows), start], upper[: len(self.rows), start]
+            return _known(lower[: len(self.rows), start], upper[: len(self.rows), start])
         last = slice(n + count, n + 2 * count)
         size = np.maximum(np.abs(lower), np.abs(upper))[:-1, :n]
         weights = np.abs(self.rows)
@@ -131,9 +137,10 @@ class Supports:
         if own is None:
             inside = self.gathering.size + np.einsum("kij,kj->ki", self.gathering.first, self.gathering.size)
             added = self.step * np.einsum("kdi,ki->kd", weights, inside) * _ROUND
-            return low - added, high + added
-        return low + own[0], high + own[1]
+            own = -added, added
+        return _known(low + own[0], high + own[1])
 
+    @quiet
     def remainder(self, low: Array, high: Array) -> tuple[Array, Array, Array]:
         """Bounds of R over every piece from those of beta (N, n): lower, upper (N, D), and |R| at the nodes."""
         if not (np.any(low) or np.any(high)):  # what is not there moves nothing
@@ -158,6 +165,11 @@ class Supports:
             own = (np.minimum(linear, 0) - rest, np.maximum(linear, 0) + rest)
         lo, hi = self._over_pieces(lower, upper, own)
         return lo, hi, np.maximum(np.abs(lower), np.abs(upper))[:, : self.n]
+
+
+def _known(low: Array, high: Array) -> tuple[Array, Array]:
+    """Bounds from below and above; infinite ones for what is no number."""
+    return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
 
 
 def _padded(rows: Array, nodes: int) -> Array:

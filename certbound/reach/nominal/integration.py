@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,6 +31,8 @@ ORDER = 6
 PIECES = 128  # at least, where the grid is chosen
 ROUNDS = 5
 LARGEST_GRID = 4096
+_FEW = 16  # numbers of a state up to which trajectories are kept: 100 MB where a solver takes the most steps it may
+_Known = dict[float, Any]  # SciPy's solutions, by the times they begin at
 MOST_EVALUATIONS = 400_000
 _NO_TIME = 2.0**-44  # share of the horizon in which the solver leaves states as they are
 PATIENCE, LEAST_PROGRESS = 5000, 1e-4
@@ -61,9 +64,10 @@ def nominal_curve(problem: Problem | Flow, points: ArrayLike, *, times: ArrayLik
     if times is not None:
         return _through(flow, np.asarray(times, dtype=float), states)
     grid = time_grid(flow, PIECES)
+    known: _Known | None = {} if states.size <= _FEW else None
     for _ in range(ROUNDS):
         poll("nominal curve")
-        curve = _through(flow, grid, states)
+        curve = _through(flow, grid, states, known)
         coarse = _estimate_defect(flow, curve) > _tolerance(curve)
         if not np.any(coarse) or len(grid) > LARGEST_GRID:
             break
@@ -165,8 +169,8 @@ def _iterate(flow: Flow, states: Array) -> Curve:
     return Curve(continuous=False, starts=instants, ends=instants, coefficients=path[:, :, None, :])
 
 
-def _through(flow: Flow, grid: Array, states: Array) -> Curve:
-    nodes = _node_states(flow, grid, states)
+def _through(flow: Flow, grid: Array, states: Array, known: _Known | None = None) -> Curve:
+    nodes = _node_states(flow, grid, states, known)
     rows = flow.plan_rows(grid[:-1])
     h = grid[1:] - grid[:-1]
     middles = np.clip(0.5 * grid[:-1] + 0.5 * grid[1:], grid[:-1], grid[1:])
@@ -205,7 +209,8 @@ class _Patience:
         self.mark = t
 
 
-def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
+def _node_states(flow: Flow, grid: Array, states: Array, known: _Known | None = None) -> Array:
+    """States at the nodes; ``known`` keeps trajectories by the times they begin at, for other nodes between these."""
     from scipy.integrate import solve_ivp
 
     count, n = states.shape
@@ -215,6 +220,10 @@ def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
     for first, last in itertools.pairwise(segments):
         if grid[last] - grid[first] <= _NO_TIME * flow.horizon:
             nodes[:, first : last + 1] = nodes[:, first : first + 1]
+            continue
+        begin, times = float(grid[first]), grid[first : last + 1]
+        if known is not None and begin in known:
+            nodes[:, first : last + 1] = known[begin](times).T.reshape(last - first + 1, count, n).swapaxes(0, 1)
             continue
         row = flow.plan_rows(grid[first : first + 1])[0]
         patience = _Patience(flow, float(grid[last] - grid[first]))
@@ -231,13 +240,16 @@ def _node_states(flow: Flow, grid: Array, states: Array) -> Array:
                 (grid[first], grid[last]),
                 start,
                 method="DOP853",
-                t_eval=grid[first : last + 1],
+                t_eval=times,
+                dense_output=known is not None,
                 rtol=1e-12,
-                atol=1e-13 * _magnitude(flow, start, slope(float(grid[first]), start)),
+                atol=1e-13 * _magnitude(flow, start, slope(begin, start)),
             )
         if solution.status != 0 or not np.all(np.isfinite(solution.y)):
             raise _lost(float(solution.t[-1]) if len(solution.t) else float(grid[first]), flow)
         nodes[:, first : last + 1] = solution.y.T.reshape(last - first + 1, count, n).swapaxes(0, 1)
+        if known is not None:
+            known[begin] = solution.sol
     return nodes
 
 

@@ -131,15 +131,18 @@ def _lift(direction: Interval, region: Region, dimension: int) -> Interval:
 
 def _room(tube: Sets, norm: Norm, gap: Interval, lifted: Interval) -> tuple[Array, Array]:
     """(gap - spread)/dual length per cell and piece, and the Euclidean length of a unit of it."""
-    spread = Interval.point(tube.spread(lifted))
-    room = (gap - spread).lo
+    room = (gap - Interval.at_most(tube.spread(lifted))).lo
     dual = np.broadcast_to(norm.dual(lifted), room.shape)
     euclidean = np.linalg.norm(lifted.mid, axis=-1)
     with np.errstate(all="ignore"):
-        safe = Interval(np.where(np.isfinite(room), room, 0.0), np.where(np.isfinite(room), room, 0.0))
-        quotient = np.where(np.isfinite(room), (safe / Interval.point(dual)).lo, -np.inf)
         factor = np.broadcast_to(dual / euclidean, room.shape)
-    return quotient, factor
+    return _in_units(room, dual), factor
+
+
+def _in_units(room: Array, unit: Array | float) -> Array:
+    """Room over a unit, rounded down; none is proved where numbers overflowed."""
+    finite = np.isfinite(room)
+    return np.where(finite, (Interval.point(np.where(finite, room, 0.0)) / Interval.point(unit)).lo, -np.inf)
 
 
 def _least(radius: Array, factor: Array) -> Clearance:
@@ -179,18 +182,17 @@ def _inside_round(
     ranges = polynomial_range(squared, span)
     largest = iv.sqrt(_nonnegative(ranges))
     rows = region.lifted(scale, tube.curve.dimension)
-    spread = Interval.point(tube.radius) * tube.norm.section(rows)
+    spread = Interval.at_most(tube.radius) * tube.norm.section(rows)
     lifted = Interval.point(rows)
     if tube.generators is not None:
         images = lifted @ Interval.point(tube.generators)
         lengths = iv.sqrt(_nonnegative(iv.sq(images).sum(axis=-2)))
-        spread = spread + Interval.point(lengths.hi).sum(axis=-1)
+        spread = spread + Interval.at_most(lengths.hi).sum(axis=-1)
     if tube.box is not None:
         image = (lifted @ tube.box.reshape(*tube.box.shape, 1))[..., 0]
-        spread = spread + Interval.point(iv.sqrt(_nonnegative(iv.sq(image).sum(axis=-1))).hi)
+        spread = spread + Interval.at_most(iv.sqrt(_nonnegative(iv.sq(image).sum(axis=-1))).hi)
     section = norm.section(rows)
-    room = Interval.point((form.radius - largest - spread).lo)
-    radius = (room / section).lo
+    radius = _in_units((form.radius - largest - spread).lo, section)
     euclidean = float(np.linalg.norm(rows, 2))
     return _least(radius, np.full(radius.shape, section / euclidean))
 

@@ -157,8 +157,8 @@ class ReachTube(Shown):
         grown = Interval.point(np.asarray(extra, dtype=float))[..., None] * dual
         above, below = (np.moveaxis(self.spread(rows[:, None, None]), 0, -1) for rows in (eye, -eye))
         centre = self.curve.range()
-        upper = centre + Interval.point(above) + grown
-        return Interval((centre - Interval.point(below) - grown).lo, upper.hi)
+        upper = centre + Interval.at_most(above) + grown
+        return Interval((centre - Interval.at_most(below) - grown).lo, upper.hi)
 
     def spread(self, directions: ArrayLike | Interval) -> Array:
         """Upper bounds of a . (x - p(t)) over the sets: directions (..., n) against (B, K) -> (..., B, K).
@@ -167,13 +167,13 @@ class ReachTube(Shown):
         axes come first.
         """
         a = directions if isinstance(directions, Interval) else Interval.point(directions)
-        total = Interval.point(self.radius) * Interval.point(self.norm.dual(a))
+        total = Interval.at_most(self.radius) * Interval.point(self.norm.dual(a))
         if self.generators is not None:
             row = a.reshape(*a.shape[:-1], 1, a.shape[-1])
             shares = (row @ Interval.point(self.generators))[..., 0, :]
-            total = total + Interval.point(shares.mag).sum(axis=-1)
+            total = total + Interval.at_most(shares.mag).sum(axis=-1)
         if self.box is not None:
-            total = total + Interval.point((a * self.box).hi).sum(axis=-1)
+            total = total + Interval.at_most((a * self.box).hi).sum(axis=-1)
         return np.asarray(np.broadcast_to(total.hi, np.broadcast_shapes(total.shape, self.radius.shape)))
 
     def support(self, directions: ArrayLike, piece: int) -> Array:
@@ -185,7 +185,7 @@ class ReachTube(Shown):
             (Interval.point(part.curve.coefficients[..., j, :]) * rows).sum(axis=-1)
             for j in range(part.curve.coefficients.shape[2])
         ]
-        total = polynomial_range(along, part.curve.span) + Interval.point(part.spread(rows))
+        total = polynomial_range(along, part.curve.span) + Interval.at_most(part.spread(rows))
         return np.asarray(total.hi.max(axis=(1, 2)).reshape(a.shape[:-1]))
 
     def center(self, t: float) -> Array:

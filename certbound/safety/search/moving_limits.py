@@ -41,10 +41,21 @@ def moving_verdict(
         resting = bring_to_rest(problem)
     except InfeasibleError as error:
         return _nothing(problem, method, str(error)) if changing else plainly(problem)
+    moving = _motions(problem)
+
+    def nearer(other: Problem) -> Verdict:
+        return decided(other) if _motions(other) < moving else plainly(other)
+
     if changing:
-        return _at_rest(problem, resting, watch, decided, method)
+        return _at_rest(problem, resting, watch, nearer, method)
     plain = _within(watch, _PLAIN, problem, plainly)
-    return plain if plain.status != "UNKNOWN" else _better(plain, _at_rest(problem, resting, watch, decided, method))
+    return plain if plain.status != "UNKNOWN" else _better(plain, _at_rest(problem, resting, watch, nearer, method))
+
+
+def _motions(problem: Problem) -> tuple[int, int]:
+    """How many sets change, and how many move: where coordinates leave no fewer, others would undo what they did."""
+    regions = [constraint.region for constraint in _asked_of(problem)]
+    return sum(one.changing for one in regions), sum(one.moving for one in regions)
 
 
 def _asked_of(problem: Problem) -> list[Inside]:

@@ -20,7 +20,7 @@ from scipy.stats import norm
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.checker.reading import Record, unpacked
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import SECOND, Budget, Unproved
 from certbound.checker.statement import read_model, starts_of
 from certbound.checker.values import batches as tm
 from certbound.checker.values import check_values_below, quadratic, walls
@@ -131,6 +131,21 @@ def test_means_after_the_noise_agree_with_quadrature() -> None:
             assert abs(taylor - mean(m + v * deviation)) <= allowed + 1e-10
     assert float(found.missing(np.array([0.2]))[0]) < 1e-5
     assert found.missing(np.array([2.0]))[0] == math.inf
+
+
+@pytest.mark.parametrize("points", [[-60.0, -0.37, 0.0, 49.0, 300.0], [-60.0], [300.0]])
+def test_cells_far_from_a_point_of_the_mesh_take_no_work_and_have_their_weight(points: list[float]) -> None:
+    edges, deviation = np.linspace(-50.0, 50.0, 2001), 0.4
+
+    budget = Budget(60.0)
+    found = axis_table(np.array(points), edges, arb(deviation), 2, budget)
+    assert 60.0 - budget.work / SECOND < 0.045 * len(points)  # of those within 17 deviations, not of 2,000 cells
+    sides = [-np.inf, *edges, np.inf]
+    for j, point in enumerate(points):
+        wide, exact = (np.diff(norm.cdf(sides, point, s)) for s in (2**0.5 * deviation, deviation))
+        assert np.all(found.weight[j] >= wide * (1 - 1e-6) - 1e-15)
+        assert found.weight[j].sum() < 1 + 1e-9
+        assert found.integrals[0, 0, j] == pytest.approx(exact, abs=1e-14)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

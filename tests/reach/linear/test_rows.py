@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ from scipy.linalg import expm
 import certbound as cb
 from certbound.gaussian.response.events import WindowEvent, WindowEvents
 from certbound.gaussian.response.levels import level_along, level_scale
-from certbound.gaussian.response.linear_response import LinearResponse, continuous_response
+from certbound.gaussian.response.linear_response import LinearResponse, continuous_response, discrete_response
 from certbound.reach.linear.answer import linear_answer
+from certbound.reach.linear.inclusion import Supports, gathering_of
 from certbound.reach.linear.linearisation import WINDOW, Linearisation
 from certbound.reach.linear.rows import inner_rows
 
@@ -122,3 +124,25 @@ def test_normals_of_kinks_are_rows_once_each_however_far_kinks_are() -> None:
 def test_what_saturates_hardly_ever_costs_no_more_than_what_does_not() -> None:
     """Boxes of the states reach beyond the kinks that sums of states stay far from."""
     assert linear_answer(followers().replace(delta=1e-5), cells=1).log10_delta < -5
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("couplings", [0.0, 3.0])
+def test_supports_of_numbers_that_overflow_are_infinite(continuous: bool, couplings: float) -> None:
+    steps, none = 40, np.zeros((2, 2))
+    slope = np.broadcast_to([[0.1, couplings], [0.0, 0.2]], (1, steps, 2, 2)).copy()
+    if continuous:
+        response = continuous_response(slope, np.zeros_like(slope), 0.1, none, none)
+    else:
+        response = discrete_response(slope, none, 0.0, none)
+    response = replace(response, transition=1e12 * response.transition)  # whose products overflow
+    gathering = gathering_of(response, slope, np.zeros((1, steps, 2, 0)), np.zeros(0), continuous=continuous)
+    rows = np.broadcast_to(np.eye(2), (steps + (not continuous), 2, 2)).copy()
+    found = Supports(response, gathering.of_cell(0), 0, rows, 0.1 * np.eye(2), continuous=continuous)
+    assert not np.isnan(found.y).any()
+    assert (found.y[-1] == np.inf).any()
+    for size in (1.0, 1e300):
+        low, high, reach = found.remainder(np.full((steps, 2), -size), np.full((steps, 2), size))
+        assert (low[-1] == -np.inf).any()
+        assert (high[-1] == np.inf).any()
+        assert not any(np.isnan(one).any() for one in (low, high, reach))

@@ -189,3 +189,22 @@ def test_a_solver_that_chatters_at_a_jump_is_given_up_soon() -> None:
     oscillator = ContinuousSystem(lambda x: [100.0 * x[1], -100.0 * x[0]], states=2)  # 16 periods are followed
     curve = nominal_curve(Problem(oscillator, initial=[1.0, 0.0], safe=[], horizon=1.0), [1.0, 0.0])
     assert curve.value(1.0)[0] == pytest.approx([np.cos(100.0), -np.sin(100.0)], abs=1e-8)
+
+
+def test_a_trajectory_is_followed_once_however_often_its_grid_is_refined(monkeypatch):
+    flow = continuous(lambda x: [x[1], 8 * (1 - x[0] ** 2) * x[1] - x[0]], 2, horizon=8.0, point=np.array([2.0, 0.1]))
+    evaluated, value = [], Flow.value
+
+    def counted(self, t, state, row):
+        evaluated.append(np.ndim(t) == 0)
+        return value(self, t, state, row)
+
+    monkeypatch.setattr(Flow, "value", counted)
+    curve = nominal_curve(flow, [[2.0, 0.1]])
+    refined = sum(evaluated)
+    assert curve.pieces > 1.5 * len(time_grid(flow, 128))
+    evaluated.clear()
+    grid = np.append(curve.starts, curve.ends[-1])
+    fresh = nominal_curve(flow, [[2.0, 0.1]], times=grid)
+    assert refined < 1.5 * sum(evaluated)
+    np.testing.assert_array_equal(curve.coefficients, fresh.coefficients)

@@ -90,6 +90,19 @@ def test_zonotope_and_box_are_subtracted_too():
     assert outside == pytest.approx(9 - 0.4 - 0.25)
 
 
+@pytest.mark.parametrize("radius", [1.5e308, np.inf])
+@pytest.mark.parametrize(
+    "constraint",
+    [Inside(Ball([0.0, 0.0], 1.0)), Inside(Ellipsoid([0.0, 0.0], np.diag([4.0, 1.0]))), Outside(Ball([9.0, 0.0], 1.0)),
+     Inside(HalfSpace([3.0, 4.0], 1.0)), Outside(Box([3, 4], [9, 9]))],
+)  # fmt: skip
+def test_a_tube_whose_numbers_overflow_leaves_no_room(constraint, radius):
+    assert room(constraint, still([0.0, 0.0], radius=radius, metric=METRIC))[0] < -1e308
+    far = still([1e200, 0.0], radius=1.0)
+    if not constraint.outside:
+        assert room(constraint, far)[0] <= -1e199
+
+
 def test_an_obstacle_in_a_metric_uses_its_nearest_point():
     # the exact distance in the P-norm from the origin to the disc, by sampling its boundary
     angles = np.linspace(0, 2 * np.pi, 200001)
