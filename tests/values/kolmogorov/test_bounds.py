@@ -233,3 +233,15 @@ def test_passes_contract_at_corners_that_paths_leave_within_a_small_part_of_a_st
         left.append(float(sum(h * r.max() for h, r in zip(side.steps, residuals))))
         side.correct(residuals)
     assert left[8] < 0.1 * left[6]
+
+
+def test_limits_whose_layer_no_cell_resolves_leave_a_lower_bound_little_error() -> None:
+    system = cb.ContinuousSystem(lambda x, y: [4 * (y - x), -y], states=["x", "y"], diffusion=0.3 * np.eye(2))
+    safe = [cb.Inside(cb.Box([-1, -1], [1, 1]))]
+    problem = cb.Problem(system, initial=[0.1, 0.1], safe=safe, horizon=1.0)
+    side = Side(stages_of(problem)[0], np.full(2, 0.12), 7, above=False)
+    side.propose()
+    for _ in range(3):
+        side.correct(side.residuals(side.begun))
+    # .063, and .21 where exits count up to a fall by twelve powers of e a cell
+    assert largest_at_start(side, starts_in(problem))[1] < 0.1
