@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import factorial, prod
+from math import comb, factorial, prod
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from certbound.lazy import compiled
 from certbound.values.polynomials import lebesgue, nodes_of, norm, to_bernstein
 
 DEGREE = 5
+_NEAREST = DEGREE + 1
 ROUNDOFF = 200 * 2.0**-53
 """Relative error of a derivative at a lattice point against the sum of the magnitudes of its terms: fewer than 200
 roundings lie on the way from a coefficient to a value (six of de Boor's recursion an axis, products and sums)."""
@@ -409,18 +410,25 @@ class Axis:
         return tuple(result)
 
     def from_nodes(self, nodes: Array | None = None) -> Array:
-        """The matrix from values at ``nodes`` (default: its own) to coefficients, by not-a-knot interpolation.
+        """The matrix from values at ``nodes`` (default: its own) to coefficients, each from `_NEAREST` nodes about it.
 
+        A coefficient is that of the polynomial through these, by its blossom at the inner knots of the B-spline. What
+        one node holds reaches no further: an interpolating spline rings, by .43 a node, from wherever it is not smooth.
         ``nodes`` may reach beyond the axis; its part within must be the axis' own. Shape (N + 5, len(nodes)).
         """
-        from scipy.interpolate import BSpline, make_interp_spline
-
         nodes = self.nodes if nodes is None else nodes
-        averages = np.array([self.knots[i + 1 : i + DEGREE + 1].mean() for i in range(self.cells + DEGREE)])
-        averages = np.clip(averages, self.nodes[0], self.nodes[-1])
-        values = make_interp_spline(nodes, np.eye(len(nodes)), k=DEGREE)(averages)
-        collocation = BSpline(self.knots, np.eye(len(averages)), DEGREE)(averages)
-        return np.asarray(np.linalg.solve(collocation, values))
+        result = np.zeros((self.cells + DEGREE, len(nodes)))
+        for i, row in enumerate(result):
+            inner = self.knots[i + 1 : i + DEGREE + 1]
+            middle = float(np.mean(inner))
+            begin = int(np.clip(np.searchsorted(nodes, middle) - _NEAREST // 2, 0, len(nodes) - _NEAREST))
+            near = nodes[begin : begin + _NEAREST]
+            unit = float(near[-1] - near[0])
+            powers = np.vander((near - middle) / unit, _NEAREST, increasing=True)
+            symmetric = np.poly(-(inner - middle) / unit)  # of x^5 + e_1 x^4 + ...
+            blossoms = np.array([symmetric[m] / comb(DEGREE, m) for m in range(DEGREE + 1)])
+            row[begin : begin + _NEAREST] = np.linalg.solve(powers.T, blossoms)
+        return result
 
 
 def apply_dense(matrices: list[Array], values: Array) -> Array:

@@ -228,3 +228,12 @@ def test_derivatives_of_a_coefficient_are_left_out_where_they_vanish_and_nowhere
     bent = trace(lambda t, x: [abs(x[0]) * x[1]], {"t": ["t"], "x": ["x", "y"]})
     (kink,) = Fields(bent, 2).on(axes, Interval(0.0, 1.0))
     assert [len(rows) - 1 for rows in kink.slopes] == [parts, parts]
+
+
+def test_what_one_node_holds_reaches_no_further_than_its_neighbours() -> None:
+    nodes = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 25))
+    axis = Axis(nodes, Sampling(5))
+    on_lattice = axis.on_lattice[0].along(axis.from_nodes(), 0)  # of a 1 at one node; an interpolating spline rings on
+    for node, values in enumerate(on_lattice.T):
+        far = np.abs(np.searchsorted(nodes, axis.lattice) - node) > 9
+        assert not values[far].any()
