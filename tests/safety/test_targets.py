@@ -101,7 +101,7 @@ def test_a_noise_free_path_that_misses_is_unsafe(time):
     else:
         system = cb.ContinuousSystem(lambda x: -x, states=["x"], diffusion=[[0.01]])
         problem = cb.Problem(system, initial=[0.8], safe=[WALL], reach=TARGET, horizon=1.3)
-    verdict = cb.verify_safety(problem, time_limit=0.2)
+    verdict = cb.verify_safety(problem, time_limit=1)
     assert verdict.status == "UNSAFE_NOMINAL"
     assert "does not 'reach -0.2 <= x <= 0.2' by" in verdict.reason
     near = cb.verify_safety(problem.replace(reach=cb.Box([-0.2], [0.3]), delta=0.9))
