@@ -69,6 +69,7 @@ v is .20 and .38, Lorenz' lower side .101 and .103, Josephson's junction .0046 a
 
 _MANY = 1.0  # log10 of the cells that paths leave within a step, from which on (to ten times as many) e is calm
 _SKETCH = 3  # degree of interpolants where little is at stake: of bulges, and where nothing is proved
+_MAKING_ROOM = 3  # turns until axes have about as many cells as asked
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
 
@@ -288,6 +289,10 @@ def _leaving(lines: tuple[Array, ...], size: Array, noise: Array) -> Array:
     return rate
 
 
+def _wider(shape: Size, factor: float, places: Array) -> Array:
+    return factor * shape(places)
+
+
 def _bump(y: Array) -> Array:
     return np.asarray(np.exp(-y * y / 2))
 
@@ -396,8 +401,16 @@ class Side:
         self._now(self.carrier, k)
 
     def on(self, shapes: Sequence[Size]) -> Side:
-        """The same side, of the only stage, on axes of other shapes."""
-        plan = plan_axes([self.setting], self.cell, self.row, shapes)[0]
+        """The same side, of the only stage, on axes of other shapes, and on about as many cells.
+
+        Shapes leave out what limits that paths graze want besides; the other cells make room for it.
+        """
+        wanted = np.prod([axis.cells for axis in self.axes])
+        wider = 1.0
+        for _ in range(_MAKING_ROOM):
+            plan = plan_axes([self.setting], self.cell, self.row, [partial(_wider, shape, wider) for shape in shapes])[0]
+            over = float(np.prod([len(line) - 1 for line in plan[0]]) / wanted)
+            wider *= max(over, 1.0) ** (1 / self.setting.dimension)
         return Side(self.setting, self.cell, self.count, self.above, plan=plan)
 
     @property

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from time import perf_counter
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from certbound.values.kolmogorov.error_shares import Shape, better_shapes
 from certbound.values.kolmogorov.splines import Derivatives, cells_of, unit
 from certbound.values.kolmogorov.start_law import StartMean
 from certbound.values.kolmogorov.witness import Witness
-from certbound.watch import poll
+from certbound.watch import poll, seconds_left
 
 _COARSEST = {2: 0.06, 3: 0.1}  # cell of the first grid, as a share of the range
 _STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
@@ -141,13 +142,18 @@ class Search:
         self.shapes: dict[bool, Shapes] = {}
         self.kept: tuple[Witness, ...] = ()
         self.estimate, self.error = math.nan, 0.0
+        self.pace = RATE[_dimension(problem)]
 
     def decided(self) -> bool:
         """Whether the bounds are near each other, or one of them has passed the target."""
         return self.upper <= max(_CLOSE * self.lower, self.delta) or self.lower > self.delta > 0
 
+    def room(self, budget: float) -> float:
+        """Work that may still be done: what is left of the budget, and what the time that is left allows."""
+        return min(budget - self.work, self.pace * seconds_left())
+
     def until(self, budget: float) -> Iterator[Bounds]:
-        """Bounds, until so much work is done in all."""
+        """Bounds, until so much work is done in all, or about until the time is over."""
         silent: Side | None = None  # the last one that nothing was said of
         while not self.decided():
             if self.cost and not self._finer(budget):
@@ -164,7 +170,7 @@ class Search:
                 side = silent = self._solved(side)
                 if above and len(self.sides) > 1 and self.estimate > _FAR * self.delta > 0:
                     continue
-                last = _LEAST * self.cost > budget - self.work
+                last = _LEAST * self.cost > self.room(budget)
                 if self._worth(side, budget) or (last and not self._hopeless(side)):
                     self._prove(side, last, budget)
                     silent = None
@@ -185,7 +191,7 @@ class Search:
         Grids of the two sides have axes of their own, so that one side's work says little of the other's.
         """
         side = self._side(above)
-        over = min(_WHOLE * side.work / max(_LEAST * (budget - self.work), 1.0), _GROWTH)
+        over = min(_WHOLE * side.work / max(_LEAST * self.room(budget), 1.0), _GROWTH)
         if over <= 1.0:
             return side
         self.cell *= over ** (1 / (self.setting.dimension + 1))
@@ -212,7 +218,7 @@ class Search:
         """Whether a bound of this grid is worth its proof: it will decide, it is cheap, or nothing is known of it."""
         if not self.delta or not math.isfinite(self.error):
             return True
-        if side.above == (self.estimate < self.delta) and _USUAL * side.work <= _CHEAP * (budget - self.work):
+        if side.above == (self.estimate < self.delta) and _USUAL * side.work <= _CHEAP * self.room(budget):
             return True
         found = self.estimate + (1 if side.above else -1) * _PROVED * self.error
         return found <= self.delta if side.above else found > self.delta
@@ -226,8 +232,10 @@ class Search:
         above = side.above
         target = math.inf if last or not self.delta else self.delta if above else -self.delta
         enough = -math.inf if not self.delta else _ENOUGH * self.delta if above else -self.delta / _ENOUGH
-        most = max((budget - self.work) / side.work, _USUAL)
+        most, begun = max(self.room(budget) / side.work, _USUAL), perf_counter()
         bound, value, passes = refined(side, self.starts, target, enough=enough, most=most)
+        if passes >= _USUAL:
+            self.pace = passes * side.work / max(perf_counter() - begun, 1e-3)
         self.work += passes * side.work
         self.kept += Witness.of(side)
         self.error = abs(abs(value) - self.estimate) / _PROVED
@@ -239,7 +247,7 @@ class Search:
     def _finer(self, budget: float) -> bool:
         """Choose the next grid by the work that is left; False where that is too little for one that is worth it."""
         dimension, delta = self.setting.dimension, self.delta
-        growth = min(_GROWTH, (budget - self.work) / self.cost)
+        growth = min(_GROWTH, self.room(budget) / self.cost)
         if growth < _LEAST:
             return False
         if delta > 0:
