@@ -23,6 +23,8 @@ _BEYOND, _WIDEST = 0.35, 4.0  # growth of cells beyond the range, and their larg
 _TO_LIMIT, _TO_FREE, _ABOUT = 0.25, 0.3, 0.12  # growth away from noisy limits, noise-free limits, grazing points
 _TYPICAL = 0.35  # of the speed at one cell's distance from a grazing point: that of what is killed there
 _LAYER = 3.0  # cells are at most a / (this |f|) at a limit
+_FEWEST, _FEWEST_AMONG = 8, 2  # cells of an axis, and between two places at which nodes stand
+_APART = 0.5  # of a cell: a node nearer than that to another serves nobody
 _SMALLEST = 0.15  # of an inner cell, at noisy limits
 
 Size = Callable[[Array], Array]
@@ -58,7 +60,8 @@ def plan_axes(stages: Sequence[Setting], cell: Array, row: int, shapes: Sequence
         cuts = cuts[(cuts >= min(float(one.low[row, i]) for one in stages))
                     & (cuts <= max(float(one.high[row, i]) for one in stages))]  # fmt: skip
         sizes = [size for own, _ in planned for size in own[i]]
-        parts = [_nodes(low, high, sizes) for low, high in pairwise(cuts)]
+        cuts = _with_places(cuts, stages[0].places[i], sizes)
+        parts = [_nodes(low, high, sizes, _FEWEST if len(cuts) == 2 else _FEWEST_AMONG) for low, high in pairwise(cuts)]
         lines.append(np.unique(np.concatenate(parts)))
     return [
         ([line[(line >= one.low[row, i]) & (line <= one.high[row, i])] for i, line in enumerate(lines)], grazing)
@@ -151,12 +154,21 @@ def _graze(
     return [Grazing(axis=axis, side=side, speed=speed, scale=scale)]
 
 
-def _nodes(low: float, high: float, sizes: list[Size]) -> Array:
+def _with_places(cuts: Array, places: Sequence[float], sizes: list[Size]) -> Array:
+    """Cuts, and those places among them that stand about a cell off all others."""
+    for place in places:
+        cell = min(float(size(np.array([place]))[0]) for size in sizes)
+        if cuts[0] < place < cuts[-1] and np.abs(cuts - place).min() > _APART * cell:
+            cuts = np.sort(np.append(cuts, place))
+    return cuts
+
+
+def _nodes(low: float, high: float, sizes: list[Size], fewest: int) -> Array:
     """Nodes whose distances follow the least of the sizes."""
     y = np.linspace(low, high, _FINE)
     density = 1 / np.min([size(y) for size in sizes], axis=0)
     count = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * (y[1] - y[0]))])
-    cells = max(int(np.ceil(count[-1])), 8)
+    cells = max(int(np.ceil(count[-1])), fewest)
     nodes = np.interp(np.linspace(0, count[-1], cells + 1), count, y)
     nodes[0], nodes[-1] = low, high
     return nodes

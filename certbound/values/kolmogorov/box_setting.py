@@ -20,8 +20,9 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.values.enclosing import squared_diffusion
 from certbound.values.kolmogorov.cell_fields import Fields
 from certbound.values.kolmogorov.factors import HALF, clock_breaks, disturbance_nodes, pace_of
+from certbound.values.kolmogorov.failed_cells import Places, ends_of, limits_and_shapes, places_of
 from certbound.values.kolmogorov.products import Product, separated
-from certbound.values.room import limits_among
+from certbound.values.room import limits_among, refuse_windows
 from certbound.values.sets import as_stays
 
 _PATHS, _STEPS, _EVERY = 2000, 400, 10
@@ -89,6 +90,12 @@ class Setting:
         Limits that are due at the end of the stage alone, rounded as ``low`` and ``high``; infinite for none.
     target : ndarray, shape (2, 2, n), or None
         Lower and upper ends of the target, rounded as ``low`` and ``high``: a path that is in it has not failed.
+    shapes : tuple of Inside
+        Obstacles and safe sets that are no limits along the coordinates.
+    places : Places
+        Where nodes serve these.
+    around : ndarray of bool, shape (2, n)
+        Whether the lower and the upper end of a coordinate is that of a box around such a safe set.
     """
 
     drift: Fields
@@ -114,6 +121,9 @@ class Setting:
     due_low: Array
     due_high: Array
     target: Array | None
+    shapes: tuple[Inside, ...]
+    places: Places
+    around: Array
     flow: Flow
     spread: Flow
 
@@ -145,8 +155,8 @@ def stages_of(problem: Problem) -> list[Setting]:
     Raises
     ------
     InfeasibleError
-        What is not served yet: moving or curved sets, starts that meet the target, models in which time or disturbances
-        are not apart from the states; the message says which.
+        What is not served yet: moving sets, obstacles in windows, starts that meet the target, models in which time
+        or disturbances are not apart from the states; the message says which.
     """
     system = problem.system
     if not isinstance(system, ContinuousSystem):
@@ -161,7 +171,14 @@ def stages_of(problem: Problem) -> list[Setting]:
     n = system.dimension
     problem, target, opens = _with_target(problem)
     horizon = float(problem.horizon)
-    ends, rooms, dues = _windows(problem, opens)
+    limits, shapes = limits_and_shapes(as_stays(problem.constraints), n)
+    for one in shapes:
+        refuse_windows(one, problem)
+    if shapes and any(isinstance(start, GaussianStart) for start in problem.starts):
+        raise InfeasibleError("values with a carried error serve normal starts among limits along coordinates only.")
+    ends, rooms, dues = _windows(problem, limits, opens)
+    within = ends_of(shapes, n)
+    rooms = [(np.maximum(low, within[0]), np.minimum(high, within[1])) for low, high in rooms]
     if target is not None:
         due = dues[-1]
         dues[-1] = target if due is None else (np.maximum(due[0], target[0]), np.minimum(due[1], target[1]))
@@ -181,7 +198,7 @@ def stages_of(problem: Problem) -> list[Setting]:
     lows, highs = (np.array([room[side] for room in rooms]) for side in (0, 1))  # (stages, rows, n)
     limited = np.stack([np.isfinite(lows[:, 0]), np.isfinite(highs[:, 0])], axis=1)
     hit = None if opens else target
-    visited = _visited(problem, start_low, start_high, ends, lows[:, 0], highs[:, 0], flow, around, hit)
+    visited = _visited(problem, start_low, start_high, ends, lows[:, 0], highs[:, 0], flow, around, hit, shapes)
     width = visited[:, 1] - visited[:, 0]
     free = [
         _beside((visited[:, 0] - _MARGIN * width).min(axis=0), lows, width.max(axis=0)),
@@ -201,7 +218,9 @@ def stages_of(problem: Problem) -> list[Setting]:
             start_low=start_low, start_high=start_high, begin=begin, horizon=end,
             staged=len(rooms) > 1 or dues[-1] is not None,
             due_low=-nowhere if due is None else due[0], due_high=nowhere if due is None else due[1],
-            target=None if target is None or begin < opens else np.array(target), flow=flow, spread=spread,
+            target=None if target is None or begin < opens else np.array(target), shapes=tuple(shapes),
+            places=places_of(shapes, n), around=limited[k] & [lows[k, 0] == within[0], highs[k, 0] == within[1]],
+            flow=flow, spread=spread,
         )
         for k, (begin, end, due) in enumerate(zip(ends[:-1], ends[1:], dues))
     ]  # fmt: skip
@@ -226,12 +245,14 @@ def _with_target(problem: Problem) -> tuple[Problem, Ends | None, float]:
     return plain, ends, first
 
 
-def _windows(problem: Problem, opens: float) -> tuple[list[float], list[Ends], list[Ends | None]]:
+def _windows(
+    problem: Problem, constraints: list[Inside], opens: float
+) -> tuple[list[float], list[Ends], list[Ends | None]]:
     """Times between which limits do not change, the limits of each stage, and those that are due at its end alone.
 
     ``opens`` is one more such time.
     """
-    horizon, constraints = float(problem.horizon), as_stays(problem.constraints)
+    horizon = float(problem.horizon)
     spans = [(0.0, horizon) if one.during is None else one.during for one in constraints]
     cuts = sorted({0.0, horizon, opens, *(float(t) for span in spans for t in span if 0 < t < horizon)})
     if (0.0, 0.0) in spans:
@@ -329,7 +350,7 @@ class _InFloats:
 
 def _visited(
     problem: Problem, low: Array, high: Array, ends: Sequence[float], inner_low: Array, inner_high: Array, flow: Flow,
-    disturbance: Array, target: Ends | None,
+    disturbance: Array, target: Ends | None, shapes: Sequence[Inside],
 ) -> Array:  # fmt: skip
     """Quantiles of where simulated paths are while they are safe, shape (stages, 2, n).
 
@@ -357,6 +378,8 @@ def _visited(
         moved = x + step * flow(x, k * step, extreme) + math.sqrt(step) * kicks.sum(axis=1)
         x = np.where(alive, moved, x)
         alive &= np.all((x > inner_low[stage][:, None]) & (x < inner_high[stage][:, None]), axis=0)
+        for shape in shapes:
+            alive &= shape.satisfied(x.T)
         if target is not None:
             alive &= ~np.all((x > target[0][0][:, None]) & (x < target[1][0][:, None]), axis=0)
         if (k % _EVERY == 0 or not seen[stage]) and alive.any():

@@ -13,8 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+import scipy.sparse as sp
 
 from certbound.arrays import Array, Index, Mask
+from certbound.problem.sets import Inside
 from certbound.rigor.intervals import Interval
 from certbound.values.enclosing import enclose
 from certbound.values.kolmogorov.axes import Grazing, Plan, Size, plan_axes
@@ -23,14 +25,18 @@ from certbound.values.kolmogorov.equation import (
     ABOUT,
     BREADTHS,
     SOLVED,
+    Breadth,
     ChangingEquation,
     Discretised,
+    Ghosts,
     at_knots,
     at_nodes,
     discretised,
+    ghosts_of,
 )
 from certbound.values.kolmogorov.face_exits import ALWAYS, Face, face_of, shortfall
 from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
+from certbound.values.kolmogorov.failed_cells import Shapes, depth_of, distance_to, most_kept, shortfall_on
 from certbound.values.kolmogorov.residual import (
     Generator,
     most_at_knots,
@@ -55,6 +61,9 @@ _OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extre
 _MARGIN = 0.1  # by which a source exceeds what it pays for
 _LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
+_DEEP = 3.0  # cells over which paths are killed, or arrive, at sets within the box
+_AROUND = 5  # cells beyond a box around a safe set of another shape: a solution that falls to 0 at the box's end rings
+_STIFF = 10.0  # how much faster than paths leave a cell nodes beyond an edge follow
 _SOFT = 3.0
 _KILL = 10.0
 _REACHED = 1.5
@@ -77,6 +86,12 @@ def ramp(y: Array) -> Array:
     """A C^2 step from 0 at 0 to 1 at 1."""
     z = np.clip(y, 0, 1)
     return np.asarray(z**3 * (10 - 15 * z + 6 * z * z))
+
+
+def rise(y: Array) -> Array:
+    """A C^2 step from 0 at 0 to 1 at 1, odd about 0, where it is steepest."""
+    z = np.clip(y, -1, 1)
+    return np.asarray(z * (15 - 10 * z**2 + 3 * z**4) / 8)
 
 
 def time_steps(horizon: float, count: int, layer: float, growth: float) -> Array:
@@ -123,7 +138,8 @@ class Mesh:
     ``inside`` holds the points of the box nearest to the nodes; ``layer`` is the survival at the end that faces allow,
     ``falls`` the share of it that limits take within the end layer, less where the flow is so strong against paths that
     the grid does not resolve their layer: no exits need be counted there. ``arrival`` is the rate of arriving in the
-    target, ``leaving`` that of leaving the cells about a node.
+    target, ``leaving`` that of leaving the cells about a node. ``ghosts`` are nodes
+    beyond shapes.
     """
 
     nodes: tuple[Array, ...]
@@ -135,6 +151,7 @@ class Mesh:
     rate: Array
     arrival: Array | float
     leaving: Array
+    ghosts: Ghosts | None
 
 
 def extended(nodes: Array, before: int, behind: int) -> Array:
@@ -155,16 +172,21 @@ def mesh_of(
     fresh: Mask,
     early: bool = False,
     solved: float = SOLVED,
+    failed: Mask | None = None,
+    shaped: bool = False,
 ) -> Mesh:
     """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones.
 
     ``fresh``, shape (2, n), says which ends are none of the stage after this; ``early`` whether paths arrive in some
-    cells before the target, or in its first cells. Systems are ``solved`` to about that.
+    cells before the target, or in its first cells. Systems are ``solved`` to about that. Paths are killed in cells that
+    have ``failed``; with ``shaped`` solutions have a given value on the edges of shapes.
     """
     n = setting.dimension
     low, high = setting.low[row], setting.high[row]
     free = {(one.axis, one.side) for one in grazing}
-    pads = tuple((pad[(i, 0) not in free], pad[(i, 1) not in free]) for i in range(n))
+    least = np.where(setting.around, _AROUND, 0)
+    own = [[max(pad[(i, side) not in free], int(least[side, i])) for side in (0, 1)] for i in range(n)]
+    pads = tuple((before, behind) for before, behind in own)
     lines = tuple(extended(nodes[i], *pads[i]) for i in range(n))
     points = np.array(np.meshgrid(*lines, indexing="ij"))
     shape = points.shape[1:]
@@ -204,26 +226,34 @@ def mesh_of(
         if kill:
             width = (0.3 * _SOFT**3 + 2) * one.scale
             rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(slowest[one.axis] / (_SOFT * one.speed))
+    if failed is not None and failed.any():
+        within = ramp(depth_of(_padded(failed, pads, setting.around)) / _DEEP)
+        rate += _KILL * np.asarray(_soonest(lines, size, noise)) * within
+    ghosts, more = None, None
+    if shaped and setting.shapes:
+        ghosts = ghosts_of(lines, partial(_within, setting.shapes))
+        stiff = _STIFF * _leaving(lines, size, noise)
+        more = sp.diags_array(stiff.ravel()) @ ghosts.matrix
+        flow, spread = flow * ~ghosts.nodes, spread * ~ghosts.nodes
+        dead &= ~ghosts.nodes
+        rate = np.where(ghosts.nodes, stiff, rate)
     arrival: Array | float = 0.0
     layer[dead] = 0
     falls = at_limit
     if setting.target is not None:
-        depth, soonest = _depth(setting.target[:, row], lines, points), np.zeros(shape)
-        for i in range(n):
-            width = np.maximum(3 * np.gradient(lines[i]), 1e-300).reshape([-1 if k == i else 1 for k in range(n)])
-            soonest = soonest + size[i] / width + noise[i, i] / width**2
+        depth = _depth(setting.target[:, row], lines, points)
         there = ramp(1 + depth if early else depth)
-        arrival = _KILL * soonest * there
+        arrival = _KILL * _soonest(lines, size, noise) * there
         rate += arrival
         layer += (1 - layer) * there
         falls *= 1 - there
     equation: Discretised | ChangingEquation = (
-        ChangingEquation(lines, dead, rate, setting.noisy) if setting.changing
-        else discretised(lines, flow, spread, dead, rate, solved)
+        ChangingEquation(lines, dead, rate, setting.noisy, more) if setting.changing
+        else discretised(lines, flow, spread, dead, rate, solved, more)
     )  # fmt: skip
     return Mesh(
         nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, falls=falls, rate=rate,
-        arrival=arrival, leaving=_leaving(lines, size, noise),
+        arrival=arrival, leaving=_leaving(lines, size, noise), ghosts=ghosts,
     )  # fmt: skip
 
 
@@ -281,12 +311,42 @@ def _extremes(setting: Setting, points: Array, flow: Array, spread: Array) -> tu
     return least, most, noise
 
 
+def _soonest(lines: tuple[Array, ...], size: Array, noise: Array) -> Array:
+    """Rates of leaving a few cells about each node."""
+    rate = np.zeros(size.shape[1:])
+    for i, line in enumerate(lines):
+        width = np.maximum(_DEEP * np.gradient(line), 1e-300).reshape([-1 if k == i else 1 for k in range(len(lines))])
+        rate += size[i] / width + noise[i, i] / width**2
+    return rate
+
+
 def _leaving(lines: tuple[Array, ...], size: Array, noise: Array) -> Array:
     rate = np.zeros(size.shape[1:])
     for i, line in enumerate(lines):
         width = np.gradient(line).reshape([-1 if k == i else 1 for k in range(len(lines))])
         rate += size[i] / width + noise[i, i] / width**2
     return rate
+
+
+def _padded(failed: Mask, pads: Sequence[tuple[int, int]], around: Array) -> Mask:
+    """Cells that have failed, and all beyond the ends of a box around a safe set."""
+    result = np.pad(failed, pads, mode="edge")
+    for k, (before, behind) in enumerate(pads):
+        line = np.moveaxis(result, k, 0)
+        line[:before] |= around[0, k]
+        line[len(line) - behind :] |= around[1, k]
+    return result
+
+
+def _largest_around(cells: Array) -> Array:
+    """The largest of each cell and its neighbours."""
+    from scipy.ndimage import maximum_filter
+
+    return np.asarray(maximum_filter(cells, 3))
+
+
+def _within(shapes: Sequence[Inside], points: Array) -> Mask:
+    return np.asarray(np.logical_and.reduce([shape.satisfied(points) for shape in shapes]))
 
 
 def _wider(shape: Size, factor: float, places: Array) -> Array:
@@ -301,12 +361,12 @@ def _nothing(part: float) -> float:
     return 0.0
 
 
-def _same(value: Array | float, part: float) -> Array | float:
-    return value
-
-
 def _between(first: Array, last: Array, part: float) -> Array:
     return (1 - part) * first + part * last
+
+
+def _same(value: Array | float, part: float) -> Array | float:
+    return value
 
 
 def _later(given: Callable[[float], Array | float], begin: float, step: float, part: float) -> Array | float:
@@ -359,10 +419,15 @@ class Side:
             after = later.setting
             fresh = np.array([after.low[row] != setting.low[row], after.high[row] != setting.high[row]])
         self.axes = tuple(Axis(line, Sampling(parts)) for line in nodes)
+        self.shapes = Shapes.of(setting.shapes, self.axes)
         self.mesh = mesh_of(
-            setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh, not above
+            setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh, not above,
+            shaped=True,
         )
-        self.carrier = mesh_of(setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh, solved=ABOUT)
+        self.carrier = mesh_of(
+            setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh, solved=ABOUT,
+            failed=self.shapes.failed,
+        )
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
         self.steps = time_steps(span * longer, steps, self.layer, _GROWTH[setting.dimension])
         self._follow_changes(int(np.ceil(setting.pace * steps)))
@@ -378,8 +443,13 @@ class Side:
             for i in range(n) for side in (0, 1)
         ]  # fmt: skip
         self.arrived = self._cells_arrived(setting)
+        if above:  # where a path has done both it may have failed first
+            self.arrived &= ~self.shapes.failed
+            self.arrived[self.shapes.cut] = False
+        self.stopped = self.arrived | self.shapes.failed
+        self.faces = [self._among_live(face) for face in self.faces if not setting.around[face.side, face.axis]]
         if self.arrived.any():
-            self.faces = [self._before_target(face) for face in self.faces] + self._target_faces()
+            self.faces += self._target_faces()
         self.values: list[Array] = []
         self.rates: list[Array] = []
         self.policy: list[Index | None] = []
@@ -408,7 +478,8 @@ class Side:
         wanted = np.prod([axis.cells for axis in self.axes])
         wider = 1.0
         for _ in range(_MAKING_ROOM):
-            plan = plan_axes([self.setting], self.cell, self.row, [partial(_wider, shape, wider) for shape in shapes])[0]
+            scaled = [partial(_wider, shape, wider) for shape in shapes]
+            plan = plan_axes([self.setting], self.cell, self.row, scaled)[0]
             over = float(np.prod([len(line) - 1 for line in plan[0]]) / wanted)
             wider *= max(over, 1.0) ** (1 / self.setting.dimension)
         return Side(self.setting, self.cell, self.count, self.above, plan=plan)
@@ -435,9 +506,9 @@ class Side:
             result &= own.reshape([-1 if j == k else 1 for j in range(len(self.axes))])
         return result
 
-    def _before_target(self, face: Face) -> Face:
-        """A face of the box without its cells within the target."""
-        there = np.take(self.arrived, -1 if face.side else 0, axis=face.axis)
+    def _among_live(self, face: Face) -> Face:
+        """A face of the box without its cells in which paths have stopped."""
+        there = np.take(self.stopped, -1 if face.side else 0, axis=face.axis)
         return replace(face, leaves=face.leaves & ~there)
 
     def _target_faces(self) -> list[Face]:
@@ -499,7 +570,8 @@ class Side:
 
         def coefficients(time: float) -> tuple[Array, Array]:
             spread = setting.spread(mesh.inside, time).reshape(n, n, *equation.shape)
-            return setting.flow(mesh.inside, time, acting), spread
+            live = 1.0 if mesh.ghosts is None else ~mesh.ghosts.nodes
+            return setting.flow(mesh.inside, time, acting) * live, spread * live
 
         equation.now(time, coefficients)
 
@@ -545,6 +617,7 @@ class Side:
     def shortfall_at_end(self) -> Array:
         """On every cell, what v at the stage's end lacks of 0, of what a limit that is due asks, or of the next v."""
         lacks = most_on_cells(self.axes, -self.values[0][None])[0]
+        lacks[self.shapes.cut] = most_kept(self.axes, self.shapes, -self.values[0])
         if self.later is not None:
             own, places = _common(self.axes, self.later.axes)
             open_ = lacks + (1.0 if self.above else 0.0)  # beyond ends of the next stage that are no limits
@@ -562,12 +635,18 @@ class Side:
         if self.later is not None:
             arrived = self._cells_arrived(self.later.setting)  # there the next v may be anything
             lacks[arrived] = most_on_cells(self.axes, -self.values[0][None])[0][arrived]
-            lacks[self.arrived] = 0.0
+        lacks[self.stopped] = 0.0
         return np.asarray(np.maximum(lacks, 0.0))
+
+    def shortfall_on_edges(self) -> Array:
+        """What v lacks of its goal where paths leave shapes, shape (slabs, cells that they cut)."""
+        values, rates = np.array(self.values), np.array(self.rates)
+        return shortfall_on(self.axes, self.shapes, self._goal(True), values, rates, self.steps)
 
     def lacking(self) -> float:
         """The most that v lacks at the end and at faces where paths can leave."""
-        return max(float(self.shortfall_at_end().max()), *(float(missing.max()) for missing in self.shortfalls()))
+        missing = [self.shortfall_at_end(), *self.shortfalls(), self.shortfall_on_edges()]
+        return max(float(one.max(initial=0.0)) for one in missing)
 
     def lift(self, share: float) -> None:
         """Raise v from above by a share of itself: nothing is asked any more where it was nearly 1."""
@@ -642,15 +721,23 @@ class Side:
         a = a * self.mesh.layer if above else a
         first = a.copy()
         tau = 0.0
+
+        def kept(a: Array) -> None:
+            speed = equation.speed(a, arrival, fall(tau))
+            self._keep(a, speed if ghosts is None else ghosts.fill(speed))
+
+        arrival, ghosts = self.mesh.arrival, self.mesh.ghosts
+        if ghosts is not None:
+            a = ghosts.fill(a * rise((distance_to(ghosts.nodes) - 0.5) / _DEEP))
         self._now(self.mesh, 0, a)
-        arrival = self.mesh.arrival
-        self._keep(a, equation.speed(a, arrival, fall(tau)))
+        kept(a)
         for k, step in enumerate(self.steps):
             if not self.brief[k]:
                 a = equation.step(a, step, partial(_same, arrival), partial(_later, fall, tau, step))
+                a = a if ghosts is None else ghosts.fill(a)
             tau += step
             self._now(self.mesh, k + 1, a)
-            self._keep(a, equation.speed(a, arrival, fall(tau)))
+            kept(a)
 
     def _keep(self, a: Array, speed: Array) -> None:
         sign = -1.0 if self.above else 1.0
@@ -688,7 +775,7 @@ class Side:
                 self.generator, self.sketch, values, rates, steps, factors, worst=self.above, clock=clock,
                 knots=None if knots is None else knots[begin : begin + len(steps) + 1],
             )  # fmt: skip
-        done = self._decided(values, rates, steps) | self.arrived
+        done = self._decided(values, rates, steps) | self.stopped
         return list(np.where(done, 0.0, np.maximum(bound, 0.0)))
 
     def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:
@@ -705,9 +792,11 @@ class Side:
         equation, breadth = self.carrier.equation, BREADTHS[min(self.passes, len(BREADTHS) - 1)]
         spread = partial(at_nodes, pads=self.carrier.pad, breadth=breadth)
         residuals = [np.zeros_like(r) if brief else r for r, brief in zip(residuals, self.brief)]
-        slabs = [spread(r) + b for r, b in zip(residuals, self._at_exits(spread))]
+        slabs = [spread(r) + b for r, b in zip(residuals, self._at_exits(spread, breadth))]
         ends = [(1 + _MARGIN) * s * equation.live for s in at_knots(slabs, self.steps, breadth)]
-        missing = (1 + _MARGIN) * spread(self.shortfall_at_end()) * equation.live
+        late = self.shortfall_at_end()
+        late[self.shapes.cut] = np.maximum(late[self.shapes.cut], self.shortfall_on_edges()[0])
+        missing = (1 + _MARGIN) * spread(late) * equation.live
         self._now(self.carrier, 0)
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
         found, speeds = [e], [equation.speed(e, ends[0])]
@@ -738,7 +827,7 @@ class Side:
             result.append(speed + share * (slope - speed))
         return result
 
-    def _at_exits(self, spread: Callable[..., Array]) -> list[Array]:
+    def _at_exits(self, spread: Callable[..., Array], breadth: Breadth) -> list[Array]:
         """Sources beyond the faces and on them, from which e takes what v lacks there, slab by slab.
 
         Beyond a face e is killed at a rate, and held near what v lacks by as large a source. Paths that graze a
@@ -746,6 +835,14 @@ class Side:
         """
         carrier = self.carrier
         total = [np.zeros(carrier.equation.shape) for _ in self.steps]
+        if len(self.shapes.cut[0]):
+            lacks, none = np.zeros(self.shapes.failed.shape), [(0, 0)] * len(self.axes)
+            for k, one in enumerate(self.shortfall_on_edges()):
+                lacks[self.shapes.cut] = one
+                around = at_nodes(_largest_around(np.pad(lacks, carrier.pad, mode="edge")), none, breadth)
+                held = _REACHED * around * carrier.rate
+                on_edge = _ON_FACE * spread(lacks) * carrier.leaving if self.passes > 1 else 0.0
+                total[k] = np.maximum(held, on_edge)
         for face, missing in zip(self.faces, self.shortfalls()):
             if not missing.any():
                 continue

@@ -26,6 +26,7 @@ from certbound.watch import poll, seconds_left
 _COARSEST = {2: 0.06, 3: 0.1}  # cell of the first grid, as a share of the range
 _STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
 _PASSES, _USUAL = 12, 5  # at most, and in most cases
+_AT_LEAST = 8  # where that many serve: to end a little late is better than to have proved nothing
 _ROUGH, _CORRECTED = 0.4, 0.4  # a solution with a look at it, and one correction, in units of a pass that proves
 _WHOLE = _USUAL + _ROUGH + _CORRECTED  # what a grid takes
 _ROUNDS = 2  # grids whose axes are improved, before the first one on which anything is proved
@@ -232,7 +233,7 @@ class Search:
         above = side.above
         target = math.inf if last or not self.delta else self.delta if above else -self.delta
         enough = -math.inf if not self.delta else _ENOUGH * self.delta if above else -self.delta / _ENOUGH
-        most, begun = max(self.room(budget) / side.work, _USUAL), perf_counter()
+        most, begun = max(self.room(budget) / side.work, _AT_LEAST), perf_counter()
         bound, value, passes = refined(side, self.starts, target, enough=enough, most=most)
         if passes >= _USUAL:
             self.pace = passes * side.work / max(perf_counter() - begun, 1e-3)
@@ -429,9 +430,10 @@ def _largest_of_sets(side: Side, starts: Starts) -> tuple[float, float]:
     ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
     if not side.above:
         within = np.all((starts.points >= ends[0]) & (starts.points <= ends[1]), axis=1)
+        within &= [not _stops_start(side, point[None], point[None]) for point in starts.points]
         low = min((_value(side, coefficients, point) for point in starts.points[within]), default=0.0)
         return low, low + _rounding(coefficients)
-    if np.any(starts.low < ends[0]) or np.any(starts.high > ends[1]):
+    if np.any(starts.low < ends[0]) or np.any(starts.high > ends[1]) or _stops_start(side, starts.low, starts.high):
         return 1.0, 1.0
     best, rough = -math.inf, -math.inf
     derivatives = Derivatives(side.axes, coefficients[None])
@@ -449,6 +451,13 @@ def _largest_of_sets(side: Side, starts: Starts) -> tuple[float, float]:
                 extra += float(np.diff(line).max()) ** 2 / 8 * size * (1 + 1e-9)
         rough, best = max(rough, most), max(best, most + extra + _rounding(coefficients))
     return rough, best
+
+
+def _stops_start(side: Side, lows: Array, highs: Array) -> bool:
+    """Whether one of some boxes meets a cell that may have failed at once."""
+    unsafe = side.shapes.failed.copy()
+    unsafe[side.shapes.cut] = True
+    return any(_over_box(side, unsafe.astype(float), low, high) > 0 for low, high in zip(lows, highs))
 
 
 def _over_box(side: Side, cells: Array, low: Array, high: Array) -> float:

@@ -12,9 +12,11 @@ error of at most `ROUNDOFF` of the sum of magnitudes in its row.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb, factorial, prod
+from typing import Any
 
 import numpy as np
 
@@ -493,6 +495,56 @@ def most_on_cells(axes: tuple[Axis, ...], coefficients: Array) -> Array:
     for k, axis in enumerate(axes):
         share += _OFF * axis.moved.reshape([-1 if j == k else 1 for j in range(len(axes))])
     return np.asarray(value + share * size)
+
+
+@lru_cache(maxsize=64)
+def subdivided(first: float, last: float) -> Array:
+    """From Bernstein coefficients of degree 5 on a cell to those between two shares of it."""
+    rows = np.eye(DEGREE + 1)
+    for split, keep_first in ((last, True), (first / last, False)):  # de Casteljau's algorithm
+        line, front, rear = rows, [rows[0]], [rows[-1]]
+        for _ in range(DEGREE):
+            line = (1 - split) * line[:-1] + split * line[1:]
+            front.append(line[0])
+            rear.append(line[-1])
+        rows = np.array(front if keep_first else rear[::-1])
+    return rows
+
+
+def controls_on_some(
+    axes: tuple[Axis, ...], coefficients: Array, cells: Sequence[Index], part: Sequence[tuple[float, float]]
+) -> tuple[Array, Array]:
+    """Bernstein coefficients of tensor splines on a part of some cells, and by how much they are off.
+
+    Parameters
+    ----------
+    axes : tuple of Axis
+    coefficients : ndarray, shape (B, N_1 + 5, ...)
+    cells : sequence of ndarray, shape (R,)
+        Their places along every axis.
+    part : sequence of (float, float)
+        Where it begins and ends along every axis, as shares of the cell.
+
+    Returns
+    -------
+    controls : ndarray, shape (B, R, 6^n)
+    off : ndarray, shape (B, R)
+    """
+    n, count = len(axes), DEGREE + 1
+    places: list[Any] = [slice(None)]
+    for k, place in enumerate(cells):
+        window = place[:, None] + np.arange(count)
+        places.append(window.reshape(-1, *[count if j == k else 1 for j in range(n)]))
+    patches = coefficients[tuple(places)]
+    share = np.full(len(cells[0]), 1e-11)
+    for axis, place in zip(axes, cells):
+        share += _OFF * axis.moved[place]
+    off = share * np.abs(patches).max(axis=tuple(range(2, n + 2)))
+    for k, (axis, place, one) in enumerate(zip(axes, cells, part)):
+        rows = subdivided(*one) @ axis.bernstein.weights.reshape(-1, count, count)[place]
+        line = np.moveaxis(patches, k + 2, -1)
+        patches = np.moveaxis(np.einsum("rij,br...j->br...i", rows, line), -1, k + 2)
+    return patches.reshape(*patches.shape[:2], -1), off
 
 
 def most_of_difference(

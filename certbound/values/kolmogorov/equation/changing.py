@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import scipy.sparse as sp
 
 from certbound.arrays import Array, Mask
 from certbound.values.kolmogorov.equation.solve import (
@@ -52,11 +53,15 @@ class ChangingEquation:
         Soft killing.
     noisy : sequence of bool
         Whether noise moves a coordinate.
+    more : sparse array, shape (size, size), optional
+        What L has besides.
     """
 
-    def __init__(self, nodes: Sequence[Array], dead: Mask, rate: Array, noisy: Sequence[bool]) -> None:
+    def __init__(
+        self, nodes: Sequence[Array], dead: Mask, rate: Array, noisy: Sequence[bool], more: sp.csr_array | None = None
+    ) -> None:  # fmt: skip
         self.nodes, self.shape, self.live = list(nodes), dead.shape, ~dead
-        self.dead, self.rate = dead, rate * self.live
+        self.dead, self.rate, self.more = dead, rate * self.live, more
         self.first = [tuple(map(banded, upwind(line, one))) for line, one in zip(nodes, noisy)]
         self.second = [banded(difference(line, NOISE if len(nodes) < 3 else NOISE[-1:], 2)) for line in nodes]
         self.central = [banded(difference(line, CENTRAL, 1)) for line in nodes]
@@ -85,6 +90,8 @@ class ChangingEquation:
         """-u_t: L u and the source at live nodes, what is given at the others; ``part`` is time that has passed."""
         flow, spread = self.at(self.time - part)
         total = source - self.rate * values
+        if self.more is not None:
+            total = total + (self.more @ values.ravel()).reshape(self.shape)
         for i, (ahead, behind) in enumerate(self.first):
             if flow[i].any():
                 total = total + np.maximum(flow[i], 0) * ahead.along(values, i)
@@ -116,7 +123,7 @@ class ChangingEquation:
         if self.time in self.kept:  # an earlier pass needed it
             self.frozen = self.kept[self.time]
             return self.frozen[0]
-        new = discretised(self.nodes, flow, spread, self.dead, self.rate)
+        new = discretised(self.nodes, flow, spread, self.dead, self.rate, more=self.more)
         self.frozen = (new, flow, spread)
         if len(self.kept) * _FILL * flow[0].size < _LARGEST:
             self.kept[self.time] = self.frozen

@@ -125,12 +125,17 @@ class Equation(_Stepped):
         Nodes whose values are given.
     rate : ndarray
         Soft killing.
+    more : sparse array, shape (size, size), optional
+        What L has besides.
     """
 
-    def __init__(self, nodes: Sequence[Array], flow: Array, spread: Array, dead: Mask, rate: Array) -> None:
+    def __init__(
+        self, nodes: Sequence[Array], flow: Array, spread: Array, dead: Mask, rate: Array,
+        more: sp.csr_array | None = None,
+    ) -> None:  # fmt: skip
         self.nodes, self.shape, self.live = list(nodes), flow.shape[1:], ~dead
         size = int(np.prod(self.shape))
-        total = sp.csr_array((size, size))
+        total = sp.csr_array((size, size)) if more is None else more
         for i in range(len(nodes)):
             width = np.gradient(nodes[i]).reshape([-1 if k == i else 1 for k in range(len(nodes))])
             smooth = np.abs(flow[i]) * width <= _PECLET * spread[i, i]
@@ -197,10 +202,11 @@ class SplitEquation(_Stepped):
     """
 
     def __init__(
-        self, nodes: Sequence[Array], flow: Array, spread: Array, dead: Mask, rate: Array, solved: float = SOLVED
+        self, nodes: Sequence[Array], flow: Array, spread: Array, dead: Mask, rate: Array, solved: float = SOLVED,
+        more: sp.csr_array | None = None,
     ) -> None:  # fmt: skip
         self.nodes, self.shape, self.live = list(nodes), flow.shape[1:], ~dead
-        self.rate, self.solved = rate * self.live, solved
+        self.rate, self.solved, self.more = rate * self.live, solved, more
         self.known: tuple[float, Array, list[_Lines]] | None = None
         self.before: Array | None = None  # the last solution
         n = len(nodes)
@@ -231,6 +237,8 @@ class SplitEquation(_Stepped):
             stencil.add(total, values, factor)
         for i, j, first, second, weight in self.mixed:
             total += factor * weight * first.along(second.along(values, j), i)
+        if self.more is not None:
+            total += factor * (self.more @ values.ravel()).reshape(self.shape)
 
     def speed(self, values: Array, source: Array | float = 0.0, given: Array | float = 0.0) -> Array:
         """-u_t: L u and the source at live nodes, what is given at the others."""
@@ -364,12 +372,13 @@ Discretised = Equation | SplitEquation
 
 
 def discretised(
-    nodes: Sequence[Array], flow: Array, spread: Array, dead: Mask, rate: Array, solved: float = SOLVED
+    nodes: Sequence[Array], flow: Array, spread: Array, dead: Mask, rate: Array, solved: float = SOLVED,
+    more: sp.csr_array | None = None,
 ) -> Discretised:  # fmt: skip
     """A matrix and its factors where there are up to two states, else factors axis by axis."""
     if len(nodes) < 3:
-        return Equation(nodes, flow, spread, dead, rate)
-    return SplitEquation(nodes, flow, spread, dead, rate, solved)
+        return Equation(nodes, flow, spread, dead, rate, more)
+    return SplitEquation(nodes, flow, spread, dead, rate, solved, more)
 
 
 def banded(matrix: sp.csr_array) -> Banded:
