@@ -70,6 +70,11 @@ def _rounded(problem: Problem, answer: EngineAnswer, attempt: int, *, above: boo
         raise CertificateError("the engine kept no function that a certificate can state.")
     effort = min(attempt, len(ROOMS) - 1)
     chosen = coarsest(problem, kept)
+    if chosen.side.setting.shapes:
+        raise CertificateError(
+            "no certificate of the backward equation states limits yet that do not lie along the coordinates: "
+            f"'{chosen.side.setting.shapes[0].label}'; the bound holds without one."
+        )
     sign = 1.0 if above else -1.0
     left = sign * (problem.delta - sign * chosen.bound)  # positive where the bound decides
     most = _SHARE * abs(chosen.bound)

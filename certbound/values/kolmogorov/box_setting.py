@@ -172,6 +172,10 @@ def stages_of(problem: Problem) -> list[Setting]:
     problem, target, opens = _with_target(problem)
     horizon = float(problem.horizon)
     limits, shapes = limits_and_shapes(as_stays(problem.constraints), n)
+    if shapes and n > 2:
+        raise InfeasibleError(
+            f"values with a carried error serve limits along the coordinates only in {n} states, not '{shapes[0].label}'."
+        )
     for one in shapes:
         refuse_windows(one, problem)
     if shapes and any(isinstance(start, GaussianStart) for start in problem.starts):

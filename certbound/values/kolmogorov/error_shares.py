@@ -58,7 +58,8 @@ def shares(side: Side, residuals: Sequence[Array], starts: Array) -> list[Array]
     n = len(side.axes)
     result = [np.zeros(axis.cells) for axis in side.axes]
     for slabs, time in _occupation(side, starts):
-        due = sum(side.steps[k] * residuals[k] for k in slabs) * time
+        due = np.asarray(sum(side.steps[k] * residuals[k] for k in slabs) * time)
+        due[side.shapes.cut] = 0.0  # what edges leave there is due to no axis
         along = _indicators(side, slabs[len(slabs) // 2])
         total = np.add.reduce(along) + 1e-300
         for i in range(n):
