@@ -131,7 +131,7 @@ def _at_once(problem: Problem, verdict: Verdict, checking: list[float]) -> str |
     except (EngineError, CertificateError):
         return None
     most = report.log10_proved
-    if most is None or not (report.valid or most < 0) or not _is_enough(problem, verdict, most):
+    if most is None or not _is_enough(problem, verdict, most) or not (report.valid or verdict.status == "SAFE"):
         return None
     return restated(text, most)
 
@@ -196,8 +196,8 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
     """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
 
     Where SAFE was proved and it says less than that, more effort is spent, and the best one is kept. It claims what was
-    proved, also where the writer had claimed more: that is tried again only while it does not settle delta. A claim of
-    less than is proved already is not checked. EngineError where no certificate could be written.
+    proved, also where the writer had claimed more, if that shows what the verdict says. A claim of less than is proved
+    already is not checked. EngineError where no certificate could be written.
     """
     from certbound.checker import parse
     from certbound.safety.answers import is_more_than
@@ -228,10 +228,11 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
         least, most = report.log10_lower_proved, report.log10_proved
         if least is not None and (report.valid or is_more_than(least, problem.delta)):
             return restated(text, least, lower=True), engine, ""
-        if most is not None and (report.valid or most < 0):
+        enough = most is not None and _is_enough(problem, verdict, most)
+        if most is not None and (report.valid or (enough and verdict.status == "SAFE")):
             found = most, restated(text, most), engine
             best = found if best is None else min(best, found)
-            if _is_enough(problem, verdict, most) and (report.valid or verdict.status == "SAFE"):
+            if enough:
                 break
         reason = report.reason
     return (None, engine, reason) if best is None else (*best[1:], "")
