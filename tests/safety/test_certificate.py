@@ -70,6 +70,19 @@ def test_over_a_jump_no_more_is_claimed_than_the_checker_sees() -> None:
     assert -10 < (report.log10_proved or 0.0) <= -3
 
 
+@pytest.mark.parametrize("place", [0.0, 0.25, -0.1, 1 / 3, 0.5])
+def test_a_jump_anywhere_is_found_and_costs_little(place: float) -> None:
+    """Parts that were looked at had gaps of an ulp between them: of x < 0 in the middle of -1 .. 1 nothing was seen."""
+    system = cb.DiscreteSystem(
+        lambda x: 0.8 * x + np.where(x < place, 0.1, -0.1), states=["x"], noise=cb.Gaussian(std=0.2)
+    )
+    problem = cb.Problem(system, initial=[0.1], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=5, delta=0.05)
+    verdict = verify_safety(problem, method="values")
+    report = check_data(certificate_data(problem, verdict))
+    assert report.valid, report.reason
+    assert report.log10_proved == pytest.approx(verdict.log10_delta, abs=0.1)
+
+
 def test_a_certificate_restated_claims_what_was_proved_of_it() -> None:
     problem = small()
     text = certificate_text(problem, verify_safety(problem, method="linear"))
