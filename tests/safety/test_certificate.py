@@ -258,7 +258,9 @@ def test_a_proof_that_more_effort_writes_again_is_not_checked_again(monkeypatch:
 
     def refuted(data: Any, *_: Any, **__: Any) -> Any:
         checked.append(data)
-        return SimpleNamespace(valid=False, log10_proved=None, log10_lower_proved=None, reason="nothing holds.")
+        return SimpleNamespace(
+            valid=False, proved=False, log10_proved=None, log10_lower_proved=None, reason="nothing holds."
+        )
 
     verdict = verify_safety(small(), method="linear")
     row = ENGINES["linear"]
@@ -283,7 +285,9 @@ def test_what_the_checker_proved_is_claimed_where_it_shows_that_all_is_safe(
 
     def proving(data: Any, *_: Any, **__: Any) -> Any:
         checked.append(data)
-        return SimpleNamespace(valid=False, log10_proved=proved, log10_lower_proved=None, reason="less follows.")
+        return SimpleNamespace(
+            valid=False, proved=False, log10_proved=proved, log10_lower_proved=None, reason="less follows."
+        )
 
     verdict = replace(verify_safety(small(), method="linear"), status=status)
     row = replace(ENGINES["linear"], write=lambda *given: ({"engine": "linear"}, -3.5 + 0.1 * given[-1], []))
@@ -308,7 +312,9 @@ def test_what_the_checker_proved_from_below_is_claimed_where_it_refutes_delta(
     def proving(data: Any, *_: Any, **__: Any) -> Any:
         checked.append(data)
         level = proved if len(checked) == 1 else -2.5
-        return SimpleNamespace(valid=False, log10_proved=None, log10_lower_proved=level, reason="less follows.")
+        return SimpleNamespace(
+            valid=False, proved=False, log10_proved=None, log10_lower_proved=level, reason="less follows."
+        )
 
     answer = EngineAnswer(log10_delta=0.0, log10_lower=-2.0, method="values")
     verdict = replace(verify_safety(small(), method="linear"), status="UNSAFE", answers={"values": answer})
@@ -326,7 +332,9 @@ def test_a_claim_of_less_than_is_proved_already_is_not_checked(monkeypatch: pyte
 
     def proving(data: Any, *_: Any, **__: Any) -> Any:
         checked.append(float.fromhex(data["claim"]["log10_delta"]))
-        return SimpleNamespace(valid=True, log10_proved=checked[-1] - 0.01, log10_lower_proved=None, reason="")
+        return SimpleNamespace(
+            valid=True, proved=True, log10_proved=checked[-1] - 0.01, log10_lower_proved=None, reason=""
+        )
 
     verdict = verify_safety(small(), method="linear")
     levels = [-2.8, -2.7, -2.9]

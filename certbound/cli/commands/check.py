@@ -131,7 +131,7 @@ def _at_once(problem: Problem, verdict: Verdict, checking: list[float]) -> str |
     except (EngineError, CertificateError):
         return None
     most = report.log10_proved
-    if most is None or not _is_enough(problem, verdict, most) or not (report.valid or verdict.status == "SAFE"):
+    if most is None or not _may_be_claimed(problem, verdict, report) or not _is_enough(problem, verdict, most):
         return None
     return restated(text, most)
 
@@ -192,6 +192,18 @@ def _is_enough(problem: Problem, verdict: Verdict, level: float) -> bool:
     return verdict.status != "SAFE" or is_at_most(min(level, 0.0), problem.delta)
 
 
+def _may_be_claimed(problem: Problem, verdict: Verdict, report: Report) -> bool:
+    """Whether a certificate is valid, or claims more than was proved of it, and that is enough for the verdict."""
+    from certbound.safety.answers import is_more_than
+
+    least, most = report.log10_lower_proved, report.log10_proved
+    if report.valid or report.proved:  # else it rests on what may not be assumed
+        return report.valid
+    if least is not None:
+        return is_more_than(least, problem.delta)
+    return most is not None and verdict.status == "SAFE" and _is_enough(problem, verdict, most)
+
+
 def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[str | None, str, str]:
     """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
 
@@ -200,7 +212,6 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
     already is not checked. EngineError where no certificate could be written.
     """
     from certbound.checker import parse
-    from certbound.safety.answers import is_more_than
     from certbound.safety.certificate import certificate_of, restated
 
     engine = reason = text = ""
@@ -226,13 +237,13 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
             reason = str(error)
             break
         least, most = report.log10_lower_proved, report.log10_proved
-        if least is not None and (report.valid or is_more_than(least, problem.delta)):
+        holds = _may_be_claimed(problem, verdict, report)
+        if least is not None and holds:
             return restated(text, least, lower=True), engine, ""
-        enough = most is not None and _is_enough(problem, verdict, most)
-        if most is not None and (report.valid or (enough and verdict.status == "SAFE")):
+        if most is not None and holds:
             found = most, restated(text, most), engine
             best = found if best is None else min(best, found)
-            if enough:
+            if _is_enough(problem, verdict, most):
                 break
         reason = report.reason
     return (None, engine, reason) if best is None else (*best[1:], "")
