@@ -35,7 +35,7 @@ VERSION = 1
 _OTHERS = ("reach", "coordinates", "logarithms", "limits", "lasting", "rate", "drift", "surely")
 """Proofs that are not called as their engine."""
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
-_RESERVED, _RESERVED_BELOW = 40.0, 12.0
+_RESERVED, _RESERVED_BELOW = 30.0, 12.0
 """Seconds of processor time for all engines that only a certificate asks; where UNSAFE was proved in another way.
 
 One that proved SAFE took 23 s on a busy machine; from below two took 85 s and proved nothing, and an upper bound can be
