@@ -375,9 +375,11 @@ def log10_text(log10: float, *, ulps: int = 0) -> str:
     ('1e-3', '5.7e-49719', '2.1e-5', '0.061', '0.76')
     >>> log10_text(-2.99999999), log10_text(-2.9999999999999996), log10_text(-2.9999999999999996, ulps=2)
     ('1.1e-3', '1.1e-3', '1e-3')
+    >>> log10_text(-math.inf)
+    '0'
     """
-    if log10 >= 0:
-        return "1"
+    if log10 >= 0 or log10 == -math.inf:
+        return "1" if log10 >= 0 else "0"
     value = _EXACT.subtract(Decimal(log10), Decimal(ulps * math.ulp(log10)))
     exponent = math.floor(value)
     digits = _digits(_EXACT.subtract(value, Decimal(exponent - 1)))

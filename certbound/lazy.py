@@ -51,6 +51,20 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
+def _protected(made: Any) -> Any:
+    """A function of numba that compiles undisturbed, for whatever types it is called the first time.
+
+    Numba's registries and files do not survive an exception while they are filled.
+    """
+
+    def undisturbed_compile(*args: Any, **kwargs: Any) -> Any:
+        with undisturbed(), uncollected():
+            return type(made).compile(made, *args, **kwargs)
+
+    made.compile = undisturbed_compile
+    return made
+
+
 class compiled(Generic[P, R]):
     """A function that numba compiles, and keeps on disk, at its first call; so is what its module compiles beside it.
 
@@ -67,7 +81,7 @@ class compiled(Generic[P, R]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         if self.kernel is not None:
             return self.kernel(*args, **kwargs)
-        with undisturbed(), uncollected():  # numba's registries do not survive an exception while they are filled
+        with undisturbed(), uncollected():
             return self._ready()(*args, **kwargs)
 
     def _ready(self) -> Callable[P, R]:
@@ -77,7 +91,7 @@ class compiled(Generic[P, R]):
             for name, value in list(self.function.__globals__.items()):
                 if isinstance(value, compiled) and value.__module__ == self.__module__:
                     ways: Any = {"no_cpython_wrapper": not value.entered, "no_cfunc_wrapper": True}
-                    made = njit(cache=True, nogil=True, **ways)(value.function)
+                    made = _protected(njit(cache=True, nogil=True, **ways)(value.function))
                     value.kernel = self.function.__globals__[name] = made
         assert self.kernel is not None
         return self.kernel

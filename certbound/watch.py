@@ -265,6 +265,21 @@ def share_of_time(part: float) -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def limited_to(seconds: float, part: float = 1.0) -> Iterator[None]:
+    """End the block quietly after so many seconds, or after a part of what the watch that runs leaves, if that is less.
+
+    Where nobody watches these are seconds of processor time of this thread, which a busy machine stretches little.
+    """
+    watch = _CURRENT.get()
+    if watch is not None:
+        with watch.share(part, seconds):
+            yield
+        return
+    with contextlib.suppress(OutOfTime), Watch(seconds, clock=time.thread_time).running():
+        yield
+
+
+@contextlib.contextmanager
 def in_proportion(part: float, least: float) -> Iterator[None]:
     """Under a limit, end the block quietly after a part of the time that was spent before it, ``least`` at least."""
     watch = _CURRENT.get()

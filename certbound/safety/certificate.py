@@ -8,7 +8,10 @@ schema is docs/certificate.md.
 from __future__ import annotations
 
 import json
+import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,30 +26,49 @@ from certbound.problem.random_constants import Random
 from certbound.problem.sets import Inside, StartUnion
 from certbound.problem.systems import ContinuousSystem
 from certbound.rigor.balls import precision, upper
-from certbound.safety.answers import Answered, EngineAnswer, Proof, exact, is_at_most, is_more_than
+from certbound.safety.answers import Answered, EngineAnswer, Proof, Request, exact, is_at_most, is_more_than
 from certbound.safety.portfolio import ENGINES
+from certbound.watch import limited_to
 
 FORMAT = "certbound certificate"
 VERSION = 1
 _OTHERS = ("reach", "coordinates", "logarithms", "limits", "lasting", "rate", "drift", "surely")
 """Proofs that are not called as their engine."""
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
+_RESERVED, _RESERVED_BELOW = 30.0, 12.0
+"""Seconds of processor time for all engines that only a certificate asks; where UNSAFE was proved in another way.
+
+One that proved SAFE took 23 s on a busy machine; from below two took 85 s and proved nothing, and an upper bound can be
+stated instead.
+"""
+_LEAST = 1.0  # second that an engine has at least
+_PART = 0.8  # of what is left of these, for the next engine
 
 def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -> str:
     """The certificate of a verdict as the text of a JSON file; see `certificate_data`."""
-    return json.dumps(certificate_data(problem, verdict, attempt=attempt), separators=(",", ":")) + "\n"
+    return certificate_of(problem, verdict, attempt=attempt)[0]
+
+
+def certificate_of(problem: Problem, verdict: Answered, *, attempt: int = 0) -> tuple[str, str]:
+    """The same, and the engine whose proof it states; empty where it is made of several certificates."""
+    data, engine = _certified(problem, verdict, attempt)
+    return json.dumps(data, separators=(",", ":")) + "\n", engine
 
 
 def restated(text: str, log10_proved: float, *, lower: bool = False) -> str:
-    """The certificate claiming what the checker proved of it, where that is less (``lower``: more) than it claimed.
+    """The certificate claiming what the checker proved of it, 10**log10_proved (``lower``: as a lower bound).
 
-    The writer leaves itself room, and its own bounds of the events are coarser in places than the checker's.
+    The writer leaves itself room, and its own bounds of the events are coarser in places than the checker's. A claim of
+    more than was proved is taken back to that, but for an upper bound that would be none.
     """
     data, name = json.loads(text), "log10_lower" if lower else "log10_delta"
     claimed = float.fromhex(data["claim"][name])
     room = _ROUNDING * (1.0 + abs(log10_proved))
     proved = log10_proved - room if lower else log10_proved + room
-    if not (proved > claimed if lower else proved < claimed):
+    stronger, holds = (
+        (proved > claimed, claimed <= log10_proved) if lower else (proved < claimed, claimed >= log10_proved)
+    )
+    if (holds and not stronger) or proved >= 0:
         return text
     data["claim"][name] = exact(proved)
     return json.dumps(data, separators=(",", ":")) + "\n"
@@ -71,12 +93,17 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     CertificateError
         If the verdict bounds no probability, or no proof of it can be stated.
     """
+    return _certified(problem, verdict, attempt)[0]
+
+
+def _certified(problem: Problem, verdict: Answered, attempt: int) -> tuple[dict[str, Any], str]:
+    """The certificate, and the engine whose proof it states."""
     refuse_moving_limits(problem, verdict)
     members, cells = getattr(verdict, "members", ()), getattr(verdict, "cells", ())
     if problem.random and not members:
         if verdict.status == "UNSAFE":
             raise CertificateError("certificates state no lower bounds where constants are drawn.")
-        return averaged(problem, cells, [_stated(one, attempt) for one in cells])
+        return averaged(problem, cells, [_stated(one, attempt) for one in cells]), ""
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         try:
             return _lower_data(problem, verdict, attempt)
@@ -84,7 +111,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
             if not _cannot_be_written(problem, verdict):
                 raise
     if members:
-        return united(problem, [certificate_data(one.problem, one, attempt=attempt) for one in members])
+        return united(problem, [certificate_data(one.problem, one, attempt=attempt) for one in members]), ""
     refusals: list[str] = []
     best: tuple[str, Proof] | None = None
     for name, answer in _answers(problem, verdict):
@@ -106,7 +133,7 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     if best is not None:
         name, (proof, log10, assumptions) = best
         claim = {"log10_delta": exact(min(log10, 0.0)), "method": _method(name, proof), "assumptions": assumptions}
-        return _whole(problem, claim, proof)
+        return _whole(problem, claim, proof), name
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no probability was bounded that a certificate could state: {why}")
 
@@ -183,8 +210,11 @@ def averaged(problem: Problem, cells: Sequence[Any], found: Sequence[Mapping[str
     return _whole(problem, claim, {"engine": "random", "cells": rows})
 
 
-def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, Any]:
-    """The certificate of UNSAFE: P(some constraint is broken) >= 10**claim from some start, for some disturbance."""
+def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> tuple[dict[str, Any], str]:
+    """The certificate of UNSAFE: P(some constraint is broken) >= 10**claim from some start, for some disturbance.
+
+    And the engine whose proof it states.
+    """
     if len(problem.starts) > 1:
         raise CertificateError(
             "certificates state no lower bounds where the start is a union: verify by itself the member that is UNSAFE."
@@ -205,7 +235,7 @@ def _lower_data(problem: Problem, verdict: Answered, attempt: int) -> dict[str, 
             "log10_delta": exact(0.0), "log10_lower": exact(log10), "method": _method(name, proof),
             "assumptions": assumptions,
         }  # fmt: skip
-        return _whole(problem, claim, proof)
+        return _whole(problem, claim, proof), name
     why = " ".join(refusals) or verdict.reason
     raise CertificateError(f"no lower bound was found that a certificate could state: {why}")
 
@@ -222,14 +252,14 @@ def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineA
     """
     useful = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_delta < 0]
     yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
-    known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
+    reserves = _Reserves(problem, verdict, _RESERVED, Request(above=True))
     # on grids an engine does all the work that it may: those that soon say what they can come first
     for name, row in sorted(ENGINES.items(), key=lambda item: item[1].dear and not item[1].soon):
         asked = verdict.answers.get(name)
         if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
             continue
         if row.reserve and row.write:
-            answer = known[name] = known[name] if name in known else _asked_now(problem, name)
+            answer = reserves.ask(name)
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
 
@@ -240,11 +270,11 @@ def _answers_below(problem: Problem, verdict: Answered) -> Iterator[tuple[str, E
     yield from sorted(found, key=lambda item: -(item[1].log10_lower or 0.0))
     if not _cannot_be_written(problem, verdict):
         return
-    known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
+    reserves = _Reserves(problem, verdict, _RESERVED_BELOW, Request(below=True))
     for name, row in ENGINES.items():
         asked = verdict.answers.get(name)
         if row.write_below is not None and (asked is None or asked.log10_lower is None):
-            answer = known[name] = known[name] if name in known else _asked_now(problem, name)
+            answer = reserves.ask(name)
             if answer.applicable and _refutes(problem, answer):
                 yield name, answer
 
@@ -259,13 +289,36 @@ def _refutes(problem: Problem, answer: EngineAnswer) -> bool:
     return answer.log10_lower is not None and is_more_than(answer.log10_lower, problem.delta)
 
 
-def _asked_now(problem: Problem, name: str) -> EngineAnswer:
-    """What an engine answers; that it does not apply where it fails."""
-    try:
-        with contained(name):
-            return ENGINES[name].prove(problem)
-    except EngineError as error:
-        return EngineAnswer(applicable=False, method=name, reason=str(error))
+class _Reserves:
+    """Engines that only a certificate asks: none twice, and all of them within some seconds of processor time."""
+
+    def __init__(self, problem: Problem, verdict: Answered, seconds: float, request: Request) -> None:
+        self._problem, self._left, self._request = problem, seconds, request
+        self._known: dict[str, EngineAnswer] = getattr(verdict, "reserves", {})
+
+    def ask(self, name: str) -> EngineAnswer:
+        """What an engine answers in a part of the time that is left; that it does not apply where it fails."""
+        if name not in self._known:
+            begun = time.thread_time()
+            self._known[name] = self._asked(name)
+            self._left = max(self._left - (time.thread_time() - begun), _LEAST)
+        return self._known[name]
+
+    def _asked(self, name: str) -> EngineAnswer:
+        found = [EngineAnswer(applicable=False, method=name, reason="the time for a certificate was over.")]
+        try:
+            with contained(name), limited_to(_PART * self._left, _PART):
+                found.append(ENGINES[name].prove(self._problem, replace(self._request, found=found.append)))
+        except EngineError as error:
+            return EngineAnswer(applicable=False, method=name, reason=str(error))
+        return max(reversed(found), key=self._worth)
+
+    def _worth(self, answer: EngineAnswer) -> float:
+        """How far an answer's bound is from none at all."""
+        if not answer.applicable:
+            return -math.inf
+        below = -math.inf if answer.log10_lower is None else answer.log10_lower
+        return below if self._request.below else -answer.log10_delta
 
 
 # ---- the problem -------------------------------------------------------------------------------------------

@@ -487,3 +487,28 @@ def _(data: Data) -> None:
     data["problem"]["initial"] = {
         "kind": "gaussian", "mean": exact([0.0, 0.0]), "covariance": exact([[1e-4, 0.0], [0.0, 1e-4]])
     }  # fmt: skip
+
+
+# ---- drifts that jump, in continuous time -----------------------------------------------------------------------
+
+
+@forges(
+    "where the drift of a value function jumps it has all values on either side", "drifting",
+    "values/batch_tapes.py", "_on_both_sides", MORE,
+)  # fmt: skip
+def _(data: Data) -> None:
+    tape = data["problem"]["dynamics"]
+    count = len(tape["nodes"])
+    tape["nodes"] += [
+        ["input", 1], ["const", exact(-0.3)], ["add", count, count + 1], ["sign", count + 2], ["const", exact(1e-2)],
+        ["mul", count + 3, count + 4], ["add", tape["outputs"][0], count + 5],
+    ]  # fmt: skip
+    tape["outputs"][0] = count + 6
+
+
+@forges(
+    "from below a drift that jumps under disturbances is unknown", "leaving below", _ABOVE, "Passage._drift",
+    "not shown to be defined",
+)  # fmt: skip
+def _(data: Data) -> None:
+    jumping(data, "sign", 1, 0.3)

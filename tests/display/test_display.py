@@ -193,5 +193,6 @@ def test_what_has_no_picture_says_so() -> None:
 
 def test_probabilities_are_rounded_up_and_never_lost() -> None:
     assert log10_text(-49718.25) == "5.7e-49719"
+    assert log10_text(-float("inf")) == "0"
     with pytest.raises(TypeError, match="must be made of JSON types"):
         plain(object())

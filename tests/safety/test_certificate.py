@@ -19,6 +19,7 @@ from certbound.safety.answers import EngineAnswer, exact
 from certbound.safety.certificate import certificate_data, certificate_text, problem_data, restated
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
+from certbound.watch import Watch, poll
 
 
 def small(**changes: Any) -> cb.Problem:
@@ -67,6 +68,19 @@ def test_over_a_jump_no_more_is_claimed_than_the_checker_sees() -> None:
     report = check_data(certificate_data(problem, verdict))
     assert report.valid
     assert -10 < (report.log10_proved or 0.0) <= -3
+
+
+@pytest.mark.parametrize("place", [0.0, 0.25, -0.1, 1 / 3, 0.5])
+def test_a_jump_anywhere_is_found_and_costs_little(place: float) -> None:
+    """Parts that were looked at had gaps of an ulp between them: of x < 0 in the middle of -1 .. 1 nothing was seen."""
+    system = cb.DiscreteSystem(
+        lambda x: 0.8 * x + np.where(x < place, 0.1, -0.1), states=["x"], noise=cb.Gaussian(std=0.2)
+    )
+    problem = cb.Problem(system, initial=[0.1], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=5, delta=0.05)
+    verdict = verify_safety(problem, method="values")
+    report = check_data(certificate_data(problem, verdict))
+    assert report.valid, report.reason
+    assert report.log10_proved == pytest.approx(verdict.log10_delta, abs=0.1)
 
 
 def test_a_certificate_restated_claims_what_was_proved_of_it() -> None:
@@ -195,11 +209,11 @@ def test_who_was_only_asked_for_a_certificate_is_asked_once_and_may_fail(monkeyp
     def refusing(*_: Any) -> Any:
         raise CertificateError("not today.")
 
-    def failing(problem: cb.Problem) -> EngineAnswer:
+    def failing(problem: cb.Problem, request: Any) -> EngineAnswer:
         asked.append("barrier")
         raise ZeroDivisionError
 
-    def proving(problem: cb.Problem) -> EngineAnswer:
+    def proving(problem: cb.Problem, request: Any) -> EngineAnswer:
         asked.append("values")
         return EngineAnswer(log10_delta=-4.0, method="values", details="a proof")
 
@@ -225,7 +239,7 @@ def test_engines_on_grids_are_asked_for_a_certificate_after_the_others(monkeypat
         raise CertificateError("not today.")
 
     def silent(name: str) -> Any:
-        def prove(problem: cb.Problem) -> EngineAnswer:
+        def prove(problem: cb.Problem, request: Any) -> EngineAnswer:
             asked.append(name)
             return EngineAnswer(applicable=False, method=name)
 
@@ -244,7 +258,9 @@ def test_a_proof_that_more_effort_writes_again_is_not_checked_again(monkeypatch:
 
     def refuted(data: Any, *_: Any, **__: Any) -> Any:
         checked.append(data)
-        return SimpleNamespace(valid=False, log10_proved=None, log10_lower_proved=None, reason="nothing holds.")
+        return SimpleNamespace(
+            valid=False, proved=False, log10_proved=None, log10_lower_proved=None, reason="nothing holds."
+        )
 
     verdict = verify_safety(small(), method="linear")
     row = ENGINES["linear"]
@@ -258,6 +274,123 @@ def test_a_proof_that_more_effort_writes_again_is_not_checked_again(monkeypatch:
     with pytest.raises(CertificateError, match="linear: nothing holds"):
         proved_certificate(small(), verdict)
     assert len(checked) > 2
+
+
+@pytest.mark.parametrize(("status", "proved", "claims"), [("SAFE", -3.2, 1), ("SAFE", -2.9, 3), ("UNKNOWN", -3.2, 3)])
+def test_what_the_checker_proved_is_claimed_where_it_shows_that_all_is_safe(
+    monkeypatch: pytest.MonkeyPatch, status: str, proved: float, claims: int
+) -> None:
+    """A claim of more than was proved was written again and again, with more effort, though 10**-3.2 < delta."""
+    checked: list[Any] = []
+
+    def proving(data: Any, *_: Any, **__: Any) -> Any:
+        checked.append(data)
+        return SimpleNamespace(
+            valid=False, proved=False, log10_proved=proved, log10_lower_proved=None, reason="less follows."
+        )
+
+    verdict = replace(verify_safety(small(), method="linear"), status=status)
+    row = replace(ENGINES["linear"], write=lambda *given: ({"engine": "linear"}, -3.5 + 0.1 * given[-1], []))
+    monkeypatch.setattr("certbound.checker.check_data", proving)
+    monkeypatch.setitem(ENGINES, "linear", row)
+    if claims > 1:  # which leaves those of other engines, here none
+        with pytest.raises(CertificateError, match="linear: less follows"):
+            proved_certificate(small(), verdict)
+    else:
+        data = parse(proved_certificate(small(), verdict))
+        assert float.fromhex(data["claim"]["log10_delta"]) == pytest.approx(proved, abs=1e-5)
+        assert float.fromhex(data["claim"]["log10_delta"]) > proved
+    assert len(checked) == claims
+
+
+@pytest.mark.parametrize(("proved", "claims"), [(-2.5, 1), (-3.5, 2)])
+def test_what_the_checker_proved_from_below_is_claimed_where_it_refutes_delta(
+    monkeypatch: pytest.MonkeyPatch, proved: float, claims: int
+) -> None:
+    checked: list[Any] = []
+
+    def proving(data: Any, *_: Any, **__: Any) -> Any:
+        checked.append(data)
+        level = proved if len(checked) == 1 else -2.5
+        return SimpleNamespace(
+            valid=False, proved=False, log10_proved=None, log10_lower_proved=level, reason="less follows."
+        )
+
+    answer = EngineAnswer(log10_delta=0.0, log10_lower=-2.0, method="values")
+    verdict = replace(verify_safety(small(), method="linear"), status="UNSAFE", answers={"values": answer})
+    row = replace(ENGINES["values"], write_below=lambda *given: ({"engine": "values"}, -2.1 - 0.1 * given[-1], []))
+    monkeypatch.setattr("certbound.checker.check_data", proving)
+    monkeypatch.setitem(ENGINES, "values", row)
+    data = parse(proved_certificate(small(), verdict))
+    assert float.fromhex(data["claim"]["log10_lower"]) == pytest.approx(-2.5, abs=1e-5)
+    assert float.fromhex(data["claim"]["log10_lower"]) < -2.5
+    assert len(checked) == claims
+
+
+def test_a_claim_of_less_than_is_proved_already_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked: list[float] = []
+
+    def proving(data: Any, *_: Any, **__: Any) -> Any:
+        checked.append(float.fromhex(data["claim"]["log10_delta"]))
+        return SimpleNamespace(
+            valid=True, proved=True, log10_proved=checked[-1] - 0.01, log10_lower_proved=None, reason=""
+        )
+
+    verdict = verify_safety(small(), method="linear")
+    levels = [-2.8, -2.7, -2.9]
+    row = replace(ENGINES["linear"], write=lambda *given: ({"engine": "linear"}, levels[given[-1]], []))
+    monkeypatch.setattr("certbound.checker.check_data", proving)
+    monkeypatch.setitem(ENGINES, "linear", row)
+    for engine in ("barrier", "quadratic", "backward", "values"):
+        monkeypatch.setitem(ENGINES, engine, replace(ENGINES[engine], write=None))
+    data = parse(proved_certificate(small(), verdict))
+    assert checked == [-2.8, -2.9]
+    assert float.fromhex(data["claim"]["log10_delta"]) == pytest.approx(-2.91, abs=1e-4)
+
+
+def test_engines_that_only_a_certificate_asks_share_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that does not come to its end leaves time to the next one, and what it had proved counts."""
+    asked: list[str] = []
+
+    def refusing(*_: Any) -> Any:
+        raise CertificateError("not today.")
+
+    def lasting(name: str, level: float) -> Any:
+        def prove(problem: cb.Problem, request: Any) -> EngineAnswer:
+            asked.append(name)
+            request.found(EngineAnswer(log10_delta=level, method=name))
+            while True:
+                poll("lasting")
+
+        return prove
+
+    def writing(problem: cb.Problem, answer: EngineAnswer, attempt: int) -> Any:
+        return {"engine": answer.method}, answer.log10_delta, []
+
+    verdict = verify_safety(small())
+    assert verdict.status == "SAFE"
+    for name, row in ENGINES.items():
+        monkeypatch.setitem(ENGINES, name, replace(row, write=refusing, reserve=name in ("barrier", "values")))
+    for name, level in (("barrier", -2.0), ("values", -4.0)):
+        monkeypatch.setitem(ENGINES, name, replace(ENGINES[name], prove=lasting(name, level), write=writing))
+    with Watch(2.0).running():
+        claim = certificate_data(small(), verdict)["claim"]
+    assert asked == ["barrier", "values"]
+    assert claim == {"log10_delta": exact(-4.0), "method": "values", "assumptions": []}
+
+
+def test_a_target_whose_certificate_is_not_proved_leaves_those_of_other_engines() -> None:
+    """Its proof is not called as its engine, which was looked for by that name."""
+    system = cb.ContinuousSystem(lambda x: [x[0] - x[0] ** 3], states=1, diffusion=[[0.1]])
+    problem = cb.Problem(
+        system, initial=[-1.0], safe=[cb.Inside(cb.Box([-2.0], [2.0]))], horizon=1.0, delta=0.05,
+        reach=cb.Box([-1.5], [np.inf]),
+    )  # fmt: skip
+    verdict = verify_safety(problem)
+    assert verdict.answers["constants"].log10_delta < verdict.answers["linear"].log10_delta < -1.4
+    report = check_data(parse(proved_certificate(problem, verdict)), problem_data(problem))
+    assert report.valid, report.reason
+    assert "linear response" in report.reason
 
 
 def test_a_certificate_that_proves_less_than_safe_is_written_again_with_more_effort() -> None:

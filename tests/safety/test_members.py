@@ -60,6 +60,20 @@ def test_a_certificate_has_a_proof_of_every_member_and_is_proved_again():
     assert "a union of 2" in report.claim
 
 
+def test_the_proofs_of_all_members_are_checked_once(monkeypatch):
+    checked = []
+
+    def seen(data, *given, **options):
+        checked.append(data["claim"]["method"])
+        return check_data(data, *given, **options)
+
+    problem = walk(RIGHT, NEAR)
+    verdict = cb.verify_safety(problem, method="linear")
+    monkeypatch.setattr("certbound.checker.check_data", seen)
+    proved_certificate(problem, verdict)
+    assert checked == ["union"]
+
+
 FORGERIES = ["swapped", "one proof twice", "one member left out", "one proof for all", "nested"]
 
 

@@ -73,3 +73,15 @@ def test_ranges_over_cells_hold_between_the_middles() -> None:
         assert np.all(found.lo <= exact.min(axis=1) + near)
         assert np.all(exact.max(axis=1) <= found.hi + near)
         assert np.all(found.hi - found.lo < 20 * np.ptp(exact, axis=1).max())
+
+
+def test_a_plan_in_steps_has_no_rate_and_no_mean_time() -> None:
+    """The model under it depends on time, through its input."""
+    system = cb.ContinuousSystem(lambda x, u: -x + u, states=1, inputs=cb.Box([-2], [2]), diffusion=0.3)
+    steps, safe = np.array([[1.5], [-1.5]]), [cb.Inside(cb.Box([-1], [1]))]
+    problem = cb.Problem(system, initial=[0], safe=safe, horizon=2.0, delta=0.05, plan=steps)
+    assert leaving_rate.bound_rate(problem) is None
+    assert mean_time.bound_mean_time(problem) is None
+    verdict = cb.verify_safety(problem, method="values")
+    assert "the plan is an array" in verdict.reason
+    assert "failed" not in verdict.reason

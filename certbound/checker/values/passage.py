@@ -358,7 +358,7 @@ class Passage:
         which, n = inputs[0].terms, self.model.dimension
         slope = [patches.derivative(which, _order(n, i)) for i in range(n)]
         total = patches.derivative(which, (1,) + (0,) * n)
-        for rate, one in zip(run(self.model.dynamics, inputs), slope):
+        for rate, one in zip(self._drift(inputs), slope):
             total = tm.add(total, tm.mul(rate, one))
         for i, j in itertools.product(range(n), repeat=2):
             if j < i:
@@ -367,6 +367,10 @@ class Passage:
             inner = tm.add(patches.derivative(which, _order(n, i, j)), energy)
             total = tm.add(total, tm.mul(tm.scaled(a[i][j], 0.5 if i == j else 1.0), inner))
         return total
+
+    def _drift(self, inputs: Sequence[Batch]) -> list[Batch]:
+        """f: where it jumps all values on both sides, but not from below, where disturbances may answer the jump."""
+        return run(self.model.dynamics, inputs, jumps=self.upper_side or not self.model.disturbance)
 
     def _squares(self, inputs: Sequence[Batch]) -> list[list[Batch]]:
         """g g^T."""

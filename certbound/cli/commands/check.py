@@ -19,6 +19,7 @@ from certbound.errors import CertificateError, EngineError, contained
 from certbound.watch import OutOfTime, poll
 
 if TYPE_CHECKING:
+    from certbound.checker import Report
     from certbound.problem.problem import Problem
     from certbound.safety.verification import Verdict
 
@@ -97,9 +98,9 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     """
     spent = [] if checking is None else checking
     if verdict.members and not any(member.status == "UNSAFE" for member in verdict.members):
-        return _united(problem, verdict, spent)
+        return _at_once(problem, verdict, spent) or _united(problem, verdict, spent)
     if problem.random:
-        return _whole_again(problem, _averaged(problem, verdict, spent), spent)
+        return _at_once(problem, verdict, spent) or _whole_again(problem, _averaged(problem, verdict, spent), spent)
     left, reasons = dict(verdict.answers), list[str]()
     while left:
         try:
@@ -116,6 +117,23 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     if not reasons:
         raise CertificateError(f"no probability was bounded that a certificate could state: {verdict.reason}")
     raise CertificateError(f"no certificate could be proved again by the checker: {' '.join(reasons)}")
+
+
+def _at_once(problem: Problem, verdict: Verdict, checking: list[float]) -> str | None:
+    """The certificate made of those of its parts, checked as a whole alone; None where that does not settle delta."""
+    from certbound.checker import parse
+    from certbound.safety.certificate import restated
+
+    try:
+        with contained("certificate"):
+            text = verdict.certificate_text(problem)
+        report = _checked(problem, parse(text), checking)
+    except (EngineError, CertificateError):
+        return None
+    most = report.log10_proved
+    if most is None or not _may_be_claimed(problem, verdict, report) or not _is_enough(problem, verdict, most):
+        return None
+    return restated(text, most)
 
 
 def _united(problem: Problem, verdict: Verdict, spent: list[float]) -> str:
@@ -145,59 +163,87 @@ def _averaged(problem: Problem, verdict: Verdict, spent: list[float]) -> dict[st
 
 def _whole_again(problem: Problem, data: dict[str, Any], spent: list[float]) -> str:
     """A certificate made of others, proved again as a whole."""
-    from certbound.checker import check_data, parse
-    from certbound.safety.certificate import problem_data
+    from certbound.checker import parse
 
     text = json.dumps(data, separators=(",", ":")) + "\n"
-    poll("checking the certificate")
-    begun = time.perf_counter()
-    report = check_data(parse(text), problem_data(problem), allow_assumptions=True)
-    spent.append(time.perf_counter() - begun)
+    report = _checked(problem, parse(text), spent)
     if not report.valid:
         raise CertificateError(f"no certificate could be proved again by the checker: {report.reason}")
     return text
 
 
+def _checked(problem: Problem, data: dict[str, Any], checking: list[float]) -> Report:
+    """What the checker says of a certificate; ``checking`` takes the seconds."""
+    from certbound.checker import check_data
+    from certbound.safety.certificate import problem_data
+
+    poll("checking the certificate")
+    begun = time.perf_counter()
+    try:
+        return check_data(data, problem_data(problem), allow_assumptions=True)
+    finally:
+        checking.append(time.perf_counter() - begun)
+
+
+def _is_enough(problem: Problem, verdict: Verdict, level: float) -> bool:
+    """Whether a bound of 10**level says what a verdict says: at most delta where it is SAFE."""
+    from certbound.safety.answers import is_at_most
+
+    return verdict.status != "SAFE" or is_at_most(min(level, 0.0), problem.delta)
+
+
+def _may_be_claimed(problem: Problem, verdict: Verdict, report: Report) -> bool:
+    """Whether a certificate is valid, or claims more than was proved of it, and that is enough for the verdict."""
+    from certbound.safety.answers import is_more_than
+
+    least, most = report.log10_lower_proved, report.log10_proved
+    if report.valid or report.proved:  # else it rests on what may not be assumed
+        return report.valid
+    if least is not None:
+        return is_more_than(least, problem.delta)
+    return most is not None and verdict.status == "SAFE" and _is_enough(problem, verdict, most)
+
+
 def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[str | None, str, str]:
     """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
 
-    Where SAFE was proved and it says less than that, more effort is spent, and the best one is kept. EngineError where
-    no certificate could be written.
+    Where SAFE was proved and it says less than that, more effort is spent, and the best one is kept. It claims what was
+    proved, also where the writer had claimed more, if that shows what the verdict says. A claim of less than is proved
+    already is not checked. EngineError where no certificate could be written.
     """
-    from certbound.checker import check_data, parse
-    from certbound.safety.answers import is_at_most
-    from certbound.safety.certificate import problem_data, restated
+    from certbound.checker import parse
+    from certbound.safety.certificate import certificate_of, restated
 
     engine = reason = text = ""
     best: tuple[float, str, str] | None = None
     for attempt in range(ATTEMPTS):
         try:
             with contained("certificate"):
-                before, text = text, verdict.certificate_text(problem, attempt=attempt)
+                before, (text, engine) = text, certificate_of(problem, verdict, attempt=attempt)
         except EngineError as error:
-            if attempt + 1 == ATTEMPTS and not engine:
+            if attempt + 1 == ATTEMPTS and not text:
                 raise
             reason = str(error)
             continue
         if text == before:  # of which the checker says the same
             continue
-        poll("checking the certificate")
-        begun = time.perf_counter()
         try:
             data = parse(text)
-            engine = str(data["claim"]["method"])
-            report = check_data(data, problem_data(problem), allow_assumptions=True)
+            claimed = float.fromhex(data["claim"]["log10_delta"])
+            if best is not None and claimed >= best[0] and not _is_enough(problem, verdict, claimed):
+                continue
+            report = _checked(problem, data, checking)
         except CertificateError as error:  # larger than the checker accepts: what was proved with less effort stands
-            engine, reason = str(json.loads(text)["claim"]["method"]), str(error)
+            reason = str(error)
             break
-        finally:
-            checking.append(time.perf_counter() - begun)
-        if report.valid and report.log10_lower_proved is not None:
-            return restated(text, report.log10_lower_proved, lower=True), engine, ""
-        if report.valid and report.log10_proved is not None:
-            found = report.log10_proved, restated(text, report.log10_proved), engine
+        least, most = report.log10_lower_proved, report.log10_proved
+        holds = _may_be_claimed(problem, verdict, report)
+        if least is not None and holds:
+            return restated(text, least, lower=True), engine, ""
+        if most is not None and holds:
+            found = most, restated(text, most), engine
             best = found if best is None else min(best, found)
-            if verdict.status != "SAFE" or is_at_most(min(found[0], 0.0), problem.delta):
+            if _is_enough(problem, verdict, most):
                 break
         reason = report.reason
     return (None, engine, reason) if best is None else (*best[1:], "")

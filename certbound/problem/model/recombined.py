@@ -174,9 +174,14 @@ class _Quotients:
 
     def factor(self, node: int) -> int | None:
         """node / x without a division; None where x is no factor of it."""
-        if node not in self._factors:
-            self._factors[node] = self._factor(node)
+        for part in _first_to_last(node, self._factors, self._factored_parts):
+            self._factors[part] = self._factor(part)
         return self._factors[node]
+
+    def _factored_parts(self, node: int) -> tuple[int, ...]:
+        """What decides whether x is a factor of a node."""
+        op, args, *_ = self.graph.nodes[node]
+        return args if op in ("mul", "add", "sub") else args[:1] if op in ("div", "neg", "sq") else ()
 
     def _factor(self, node: int) -> int | None:
         graph, (op, args, value, _) = self.graph, self.graph.nodes[node]
@@ -202,9 +207,18 @@ class _Quotients:
 
     def of(self, node: int) -> int:
         """node / x: of a sum term by term."""
-        if node not in self._found:
-            self._found[node] = self._of(node)
+        for part in _first_to_last(node, self._found, self._divided_parts):
+            self._found[part] = self._of(part)
         return self._found[node]
+
+    def _divided_parts(self, node: int) -> tuple[int, ...]:
+        """What of a node is divided in its place."""
+        op, args, *_ = self.graph.nodes[node]
+        if self.factor(node) is not None or op not in ("add", "sub", "neg", "mul"):
+            return ()
+        if op != "mul":
+            return args
+        return next(((b,) for a, b in (args, args[::-1]) if self.graph.number(a) is not None), ())
 
     def _of(self, node: int) -> int:
         graph, (op, args, *_) = self.graph, self.graph.nodes[node]
@@ -219,6 +233,20 @@ class _Quotients:
             if graph.number(a) is not None:
                 return graph.apply("mul", a, self.of(b))
         return graph.apply("div", node, self.x)
+
+
+def _first_to_last(node: int, known: Collection[int], parts: Callable[[int], tuple[int, ...]]) -> list[int]:
+    """A node and its parts, and theirs, but for what is known: each after its own parts, which are earlier nodes.
+
+    An expression may be deeper than calls can be.
+    """
+    found, left = set[int](), [node]
+    while left:
+        last = left.pop()
+        if last not in found and last not in known:
+            found.add(last)
+            left += parts(last)
+    return sorted(found)
 
 
 def in_logarithms(

@@ -114,7 +114,8 @@ def effects(problem: Problem, engine: Linearisation) -> Array:
         own = spread[np.ix_(range(len(spread)), places, places)]
         deviation = np.sqrt(np.maximum(np.einsum("ji,kil,jl->kj", rows, own, rows), 1e-300))
         first, last = (0.0, np.inf) if constraint.during is None else constraint.during
-        far = np.where(((times >= first) & (times <= last))[:, None], np.abs(room) / deviation, np.inf)
+        apart = np.maximum(np.maximum(first - times, times - last), 0.0)  # a window may lie between two times
+        far = np.where((apart == apart.min())[:, None], np.abs(room) / deviation, np.inf)
         unit = deviation[..., None] if isinstance(region.form, Faces) else 1.0  # of a round set: its own size
         found.append(np.einsum("ji,kil->kjl", rows, maps[:, places]) / unit)
         sizes.append(far)

@@ -189,8 +189,8 @@ def _jumps(problem: Problem, grid: Grid) -> list[list[float]]:
             ]
             return np.concatenate(parts, axis=1)
 
-        low = np.linspace(edges[0], edges[-1], _LOOKED + 1)[:-1]
-        high = low + (edges[-1] - edges[0]) / _LOOKED
+        ends = np.linspace(edges[0], edges[-1], _LOOKED + 1)
+        low, high = ends[:-1], ends[1:]  # without a gap, in which a jump might lie
         for _ in range(60):
             middles = (low + high) / 2
             left = np.abs(at(middles) - at(low)).sum(axis=1) >= np.abs(at(high) - at(middles)).sum(axis=1)

@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import zlib
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
@@ -622,3 +623,15 @@ def test_a_start_on_the_edge_of_an_obstacle_is_proved_to_fail() -> None:
     assert verdict.status == "UNSAFE"
     report = check_data(verdict.certificate)
     assert report.valid, report.reason
+
+
+@pytest.mark.parametrize("side", [np.sign, lambda x: np.where(x < 0, -1.0, 1.0)], ids=["sign", "where"])
+def test_a_drift_that_jumps_is_paid_for_on_the_cells_that_hold_the_jump(side: Callable[[Any], Any]) -> None:
+    """It was unknown there, so that no value function of such a model in continuous time had a certificate."""
+    system = cb.ContinuousSystem(lambda x: -x - 0.5 * side(x), states=["x"], diffusion=0.3)
+    problem = cb.Problem(system, initial=[0.1], safe=[cb.Inside(cb.Box([-1], [1]))], horizon=1.0, delta=0.05)
+    verdict = cb.verify_safety(problem, method="values")
+    report = check_data(parse(verdict.certificate_text(problem)), problem_data(problem))
+    assert report.valid, report.reason
+    assert verdict.log10_delta < -8
+    assert report.log10_proved == pytest.approx(verdict.log10_delta, abs=0.1)

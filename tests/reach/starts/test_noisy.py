@@ -88,3 +88,17 @@ def test_cells_of_whose_points_nothing_is_proved_are_not_halved(monkeypatch: pyt
     assert (found.lower, found.upper) == (0.0, 1.0)
     assert len(looked) == 3 * 16
     assert sum(half == 0 for half in looked) == 2 * 16
+
+
+def test_a_window_between_two_times_that_are_looked_at_is_seen_from_the_nearest_one() -> None:
+    """Nowhere in the window anything was seen, of which no number came, and the engine failed."""
+    system = cb.ContinuousSystem(
+        lambda x: [x[1], -x[0] - 0.5 * x[1]], states=2, diffusion=[[0.0, 0.0], [0.05, 0.02]]
+    )
+    start = cb.GaussianStart([0.0, 0.0], [[0.04, 0.0], [0.0, 0.04]])
+    safe = [cb.Inside(cb.HalfSpace([0.0, 1.0], 0.45), during=(0.123456, 0.123456))]
+    problem = cb.Problem(system, initial=start, safe=safe, horizon=1.0, delta=0.1)
+    found = bound_noisy_start(problem, most=60, enough=never)
+    simulated = cb.simulate_exits(problem, paths=50_000, halve=False)
+    assert found.lower <= simulated.upper
+    assert simulated.lower <= found.upper < 2 * simulated.upper

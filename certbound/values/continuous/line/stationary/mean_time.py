@@ -84,8 +84,8 @@ def _within(
 
 
 def squared_of(problem: Problem) -> Tape | None:
-    """g^2, of a model in continuous time without t; None elsewhere."""
-    if not isinstance(problem.system, ContinuousSystem):
+    """g^2, of a model in continuous time without t, and without a plan in steps; None elsewhere."""
+    if not isinstance(problem.system, ContinuousSystem) or problem.input_sequence is not None:
         return None
     square = squared_diffusion(problem.system.diffusion, problem.system.states)
     clock = any(0 in slots for tape in (problem.closed_loop, square) for slots in sources(tape))
