@@ -174,7 +174,8 @@ def stages_of(problem: Problem) -> list[Setting]:
     limits, shapes = limits_and_shapes(as_stays(problem.constraints), n)
     if shapes and n > 2:
         raise InfeasibleError(
-            f"values with a carried error serve limits along the coordinates only in {n} states, not '{shapes[0].label}'."
+            f"values with a carried error serve in {n} states limits along the coordinates only, "
+            f"not '{shapes[0].label}'."
         )
     for one in shapes:
         refuse_windows(one, problem)
