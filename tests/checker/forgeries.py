@@ -1082,7 +1082,13 @@ def _(data: Data) -> None:
 
 @forges("the dynamics is defined where V is negative", "leaving", "values/passage.py", "Passage._payments", "defined")
 def _(data: Data) -> None:
-    jumping(data, "sign", 1, 0.6)
+    tape = data["problem"]["dynamics"]
+    count = len(tape["nodes"])
+    tape["nodes"] += [
+        ["input", 1], ["const", exact(-0.6)], ["add", count, count + 1], ["const", exact(1e-12)],
+        ["div", count + 3, count + 2], ["add", tape["outputs"][0], count + 4],
+    ]  # fmt: skip
+    tape["outputs"][0] = count + 5
 
 
 @forges("what is paid as eps is not negative", "leaving", "values/passage.py", "Passage", "must not be negative")

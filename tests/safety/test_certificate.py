@@ -15,7 +15,7 @@ import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.cli.commands.check import proved_certificate
 from certbound.errors import CertificateError
-from certbound.safety.answers import EngineAnswer, exact
+from certbound.safety.answers import EngineAnswer, exact, is_at_most
 from certbound.safety.certificate import certificate_data, certificate_text, problem_data, restated
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
@@ -405,6 +405,22 @@ def test_a_certificate_that_proves_less_than_safe_is_written_again_with_more_eff
     least = np.log10(problem.delta)
     assert float.fromhex(certificate_data(problem, verdict)["claim"]["log10_delta"]) > least
     assert float.fromhex(parse(proved_certificate(problem, verdict))["claim"]["log10_delta"]) <= least
+
+
+def test_a_certificate_of_quadratic_bounds_claims_less_than_delta_itself() -> None:
+    """The float log10(delta) is above the logarithm of every second delta, and so SAFE seemed not to be shown."""
+    system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.2 * np.eye(2))
+    safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
+    problem = cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=1.0, delta=0.1)
+    verdict = verify_safety(problem, method="quadratic")
+    level = verdict.answers["quadratic"].log10_delta
+    assert level < -2
+    for k in range(8):
+        delta = 10.0 ** (level + 0.01 * (k + 1))
+        claim = certificate_data(problem.replace(delta=delta), verdict)["claim"]
+        assert claim["method"] == "quadratic"
+        assert level < float.fromhex(claim["log10_delta"])
+        assert is_at_most(float.fromhex(claim["log10_delta"]), delta)
 
 
 def test_a_law_of_an_unknown_class_is_stated_by_no_certificate() -> None:

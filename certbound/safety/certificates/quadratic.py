@@ -105,4 +105,4 @@ def _rounded(numbers: Array) -> Array:
 def _claim(log10: float, delta: float, room: float) -> float:
     """log10 of a probability a little above, and not above delta where the other was not."""
     left = math.log10(delta) - log10
-    return min(log10 + (min(room, left) if left > 0 else room), 0.0)
+    return min(log10 + (min(room, left / 2) if left > 0 else room), 0.0)

@@ -23,7 +23,7 @@ _BEYOND, _WIDEST = 0.35, 4.0  # growth of cells beyond the range, and their larg
 _TO_LIMIT, _TO_FREE, _ABOUT = 0.25, 0.3, 0.12  # growth away from noisy limits, noise-free limits, grazing points
 _TYPICAL = 0.35  # of the speed at one cell's distance from a grazing point: that of what is killed there
 _LAYER = 3.0  # cells are at most a / (this |f|) at a limit
-_FEWEST, _FEWEST_AMONG = 8, 2  # cells of an axis, and between two places at which nodes stand
+_FEWEST, _FEWEST_AMONG = 8, 2  # cells between places at which nodes have to stand, and at which they serve shapes
 _APART = 0.5  # of a cell: a node nearer than that to another serves nobody
 _SMALLEST = 0.15  # of an inner cell, at noisy limits
 
@@ -60,8 +60,9 @@ def plan_axes(stages: Sequence[Setting], cell: Array, row: int, shapes: Sequence
         cuts = cuts[(cuts >= min(float(one.low[row, i]) for one in stages))
                     & (cuts <= max(float(one.high[row, i]) for one in stages))]  # fmt: skip
         sizes = [size for own, _ in planned for size in own[i]]
-        cuts = _with_places(cuts, stages[0].places[i], sizes)
-        parts = [_nodes(low, high, sizes, _FEWEST if len(cuts) == 2 else _FEWEST_AMONG) for low, high in pairwise(cuts)]
+        places = stages[0].places[i]
+        cuts, fewest = _with_places(cuts, places, sizes), _FEWEST_AMONG if places else _FEWEST
+        parts = [_nodes(low, high, sizes, fewest) for low, high in pairwise(cuts)]
         lines.append(np.unique(np.concatenate(parts)))
     return [
         ([line[(line >= one.low[row, i]) & (line <= one.high[row, i])] for i, line in enumerate(lines)], grazing)

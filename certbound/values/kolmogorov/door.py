@@ -430,7 +430,7 @@ def _largest_of_sets(side: Side, starts: Starts) -> tuple[float, float]:
     ends = np.array([[axis.nodes[0], axis.nodes[-1]] for axis in side.axes]).T
     if not side.above:
         within = np.all((starts.points >= ends[0]) & (starts.points <= ends[1]), axis=1)
-        within &= [not _stops_start(side, point[None], point[None]) for point in starts.points]
+        within &= [not (ok and _stops_start(side, one[None], one[None])) for ok, one in zip(within, starts.points)]
         low = min((_value(side, coefficients, point) for point in starts.points[within]), default=0.0)
         return low, low + _rounding(coefficients)
     if np.any(starts.low < ends[0]) or np.any(starts.high > ends[1]) or _stops_start(side, starts.low, starts.high):
@@ -455,6 +455,8 @@ def _largest_of_sets(side: Side, starts: Starts) -> tuple[float, float]:
 
 def _stops_start(side: Side, lows: Array, highs: Array) -> bool:
     """Whether one of some boxes meets a cell that may have failed at once."""
+    if not side.setting.shapes:
+        return False
     unsafe = side.shapes.failed.copy()
     unsafe[side.shapes.cut] = True
     return any(_over_box(side, unsafe.astype(float), low, high) > 0 for low, high in zip(lows, highs))
