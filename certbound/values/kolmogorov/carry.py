@@ -228,7 +228,7 @@ def mesh_of(
             rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(slowest[one.axis] / (_SOFT * one.speed))
     if failed is not None and failed.any():
         within = ramp(depth_of(_padded(failed, pads, setting.around)) / _DEEP)
-        rate += _KILL * np.asarray(_soonest(lines, size, noise)) * within
+        rate += _KILL * _leaving(lines, size, noise, _DEEP) * np.asarray(within)
     ghosts, more = None, None
     if shaped and setting.shapes:
         ghosts = ghosts_of(lines, partial(_within, setting.shapes))
@@ -243,7 +243,7 @@ def mesh_of(
     if setting.target is not None:
         depth = _depth(setting.target[:, row], lines, points)
         there = ramp(1 + depth if early else depth)
-        arrival = _KILL * _soonest(lines, size, noise) * there
+        arrival = _KILL * _leaving(lines, size, noise, _DEEP) * there
         rate += arrival
         layer += (1 - layer) * there
         falls *= 1 - there
@@ -311,19 +311,11 @@ def _extremes(setting: Setting, points: Array, flow: Array, spread: Array) -> tu
     return least, most, noise
 
 
-def _soonest(lines: tuple[Array, ...], size: Array, noise: Array) -> Array:
-    """Rates of leaving a few cells about each node."""
+def _leaving(lines: tuple[Array, ...], size: Array, noise: Array, cells: float = 1.0) -> Array:
+    """Rates of leaving some cells about each node."""
     rate = np.zeros(size.shape[1:])
     for i, line in enumerate(lines):
-        width = np.maximum(_DEEP * np.gradient(line), 1e-300).reshape([-1 if k == i else 1 for k in range(len(lines))])
-        rate += size[i] / width + noise[i, i] / width**2
-    return rate
-
-
-def _leaving(lines: tuple[Array, ...], size: Array, noise: Array) -> Array:
-    rate = np.zeros(size.shape[1:])
-    for i, line in enumerate(lines):
-        width = np.gradient(line).reshape([-1 if k == i else 1 for k in range(len(lines))])
+        width = cells * np.gradient(line).reshape([-1 if k == i else 1 for k in range(len(lines))])
         rate += size[i] / width + noise[i, i] / width**2
     return rate
 
@@ -443,9 +435,6 @@ class Side:
             for i in range(n) for side in (0, 1)
         ]  # fmt: skip
         self.arrived = self._cells_arrived(setting)
-        if above:  # where a path has done both it may have failed first
-            self.arrived &= ~self.shapes.failed
-            self.arrived[self.shapes.cut] = False
         self.stopped = self.arrived | self.shapes.failed
         self.faces = [self._among_live(face) for face in self.faces if not setting.around[face.side, face.axis]]
         if self.arrived.any():

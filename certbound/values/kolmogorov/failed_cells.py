@@ -1,7 +1,7 @@
 """Obstacles and safe sets of any shape, by cells (Thm K10, 10.5).
 
-A path fails on the edge of the safe set, so in a cell that is neither surely safe nor failed as a whole. There v has
-a goal in those parts of the cell that the edge meets; in failed cells nothing is asked of it. Limits along the
+A path fails on the edge of the safe set, so in a cell that is neither proved safe nor failed as a whole. There v has a
+goal in those parts of the cell that the edge meets; in failed cells nothing is asked of it. Limits along the
 coordinates stand on ends of the box instead, where they lose nothing.
 """
 
@@ -79,7 +79,7 @@ class Shapes:
     failed : ndarray of bool, shape (N_1, ...)
         Cells all of which has failed: no path gets there.
     cut : tuple of ndarray, shapes (R,)
-        Places of the cells that are neither failed nor surely safe.
+        Places of the cells that are neither failed nor proved safe.
     met, kept : ndarray of bool, shape (R, 6, ...)
         Of the parts of each of these those that are neither: in one of them a path fails;
         and those that have not failed.

@@ -12,7 +12,7 @@ from certbound.values.kolmogorov import bound_failing
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.door import largest_at_start, refined, side_of, starts_in
 from certbound.values.kolmogorov.failed_cells import Shapes
-from certbound.values.kolmogorov.splines import Axis, Sampling
+from certbound.values.kolmogorov.splines import Axis, Sampling, controls_on_some
 
 SHAPES = {
     "disc": [cb.Inside(cb.Ball([0, 0], 1.0))],
@@ -125,6 +125,37 @@ def test_a_start_in_a_cell_that_the_edge_cuts_is_bounded_by_nothing() -> None:
         side = side_of(stages_of(asked), 0.05, 24, above)
         side.propose()
         assert largest_at_start(side, starts_in(asked))[1] == (1.0 if above else pytest.approx(0.0, abs=1e-9))
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_a_target_that_an_obstacle_cuts_is_met_on_all_of_its_faces(above: bool) -> None:
+    system = cb.ContinuousSystem(lambda x, y: [1.0 + 0 * x, -y], states=["x", "y"], diffusion=0.25 * np.eye(2))
+    room = [cb.Inside(cb.Box([-1, -1.2], [3, 1.2])), cb.Outside(cb.Ball([2.1, 0.4], 0.3))]
+    reach = cb.Reach(cb.HalfSpace([-1, 0], -2))
+    asked = cb.Problem(system, initial=[0, 0], safe=room, reach=reach, horizon=4.0)
+    side = side_of(stages_of(asked), 0.06, 24, above)
+    x = side.axes[0].nodes
+    ahead = x[:-1] >= 2 - 1e-6
+    assert np.array_equal(side.arrived, np.broadcast_to(ahead[:, None], side.arrived.shape))
+    side.propose()
+    side.values = [one - 0.5 for one in side.values]  # below 0 on the faces by which paths arrive
+    faces = [missing.max() for face, missing in zip(side.faces, side.shortfalls()) if face.place is not None]
+    assert max(faces) > 0.3
+
+
+def test_coefficients_on_a_part_of_a_cell_are_those_of_the_same_function() -> None:
+    axes, rng = grid(), np.random.default_rng(5)
+    coefficients = rng.normal(size=(1, *(axis.cells + 5 for axis in axes)))
+    cells, part = (np.array([4, 9]), np.array([7, 0])), [(0.25, 0.5), (0.97, 1.0)]
+    found, off = controls_on_some(axes, coefficients, cells, part)
+    for corner in [(0, 0), (-1, 0), (0, -1), (-1, -1)]:
+        shares = [one[end] for one, end in zip(part, corner)]
+        for cell in (0, 1):
+            value = coefficients[0]
+            for axis, place, share in zip(axes, cells, shares):
+                a, b = axis.nodes[place[cell]], axis.nodes[place[cell] + 1]
+                value = axis.at_points(np.array([a + share * (b - a)]), 0).along(value, 0)[0]
+            assert found.reshape(2, 6, 6)[cell][corner] == pytest.approx(float(value), abs=1e-11 + float(off[0, cell]))
 
 
 def test_an_obstacle_beside_the_way_is_met_as_often_as_paths_say() -> None:
