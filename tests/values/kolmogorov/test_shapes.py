@@ -103,6 +103,9 @@ def test_what_lacks_on_edges_is_noticed_and_paid(above: bool) -> None:
     assert side.lacking() >= 1.0
     before = side.shortfall_on_edges().max()
     assert before == pytest.approx(1.0)
+    late = side.shortfall_at_end()  # asked of all that has not failed
+    assert late[side.shapes.cut][side.shapes.kept.any(axis=(1, 2))] == pytest.approx(0.0 if above else 2.0, abs=1e-9)
+    assert np.all(late[side.shapes.failed] == 0)
     for _ in range(3):
         side.correct(side.residuals())
     assert side.shortfall_on_edges().max() < 0.3 * before
