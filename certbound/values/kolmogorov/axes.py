@@ -1,7 +1,8 @@
 """Graded axes: cells that are small where the solution varies, by the scales of the equation.
 
 - Inside, a cell is a share of the range that paths visit; beyond the range cells grow.
-- Toward a limit that noise crosses against the flow, the solution has a layer of width a / (2 |f_n|).
+- Toward a limit that noise crosses cells are small: the solution has layers there, of width a / (2 |f_n|) where the
+  flow leads away from it, and of width sqrt(a tau) a time tau before the end.
 - Toward a noise-free limit, paths graze it where the flow across, c v, changes its sign. Noise smooths what grazing
   leaves over the distance c v_0^3 / a, where v_0 is the cell about v = 0.
 """
@@ -22,10 +23,10 @@ _ALONG = 41  # points along each axis of a face
 _BEYOND, _WIDEST = 0.35, 4.0  # growth of cells beyond the range, and their largest size there
 _TO_LIMIT, _TO_FREE, _ABOUT = 0.25, 0.3, 0.12  # growth away from noisy limits, noise-free limits, grazing points
 _TYPICAL = 0.35  # of the speed at one cell's distance from a grazing point: that of what is killed there
-_LAYER = 3.0  # cells are at most a / (this |f|) at a limit
 _FEWEST, _FEWEST_AMONG = 8, 2  # cells between places at which nodes have to stand, and at which they serve shapes
 _APART = 0.5  # of a cell: a node nearer than that to another serves nobody
-_SMALLEST = 0.15  # of an inner cell, at noisy limits
+_SMALLEST = 0.15  # of an inner cell, where a limit is due
+_AT_LIMIT = 0.15  # of an inner cell, at noisy limits
 
 Size = Callable[[Array], Array]
 
@@ -86,13 +87,12 @@ def _sizes(
         for side, place in enumerate((low[i], high[i])):
             if not setting.limited[side, i]:
                 continue
+            if setting.noisy[i] and not shapes:
+                sizes[i].append(_toward(place, _AT_LIMIT * cell[i] * width[i]))
             points = _face(setting, low, high, i, place)
             for time in setting.moments(i):
                 f, a = setting.flow(points, time)[i], setting.spread(points, time).reshape(n, n, *points.shape[1:])
-                if setting.noisy[i] and not shapes:
-                    most = cell[i] * width[i]
-                    sizes[i].append(_toward(place, layer_width(setting, points, f, a[i, i], i, side, most)))
-                elif not setting.noisy[i]:
+                if not setting.noisy[i]:
                     grazing += _graze(setting, points, f, a, i, side, cell * width, sizes, place, time)
         for place in (setting.due_low[row, i], setting.due_high[row, i]):
             if np.isfinite(place):
@@ -114,14 +114,6 @@ def _face(setting: Setting, low: Array, high: Array, axis: int, place: float) ->
     lines = [np.linspace(max(low[k], setting.range[0, k]), min(high[k], setting.range[1, k]), _ALONG) for k in range(n)]
     lines[axis] = np.array([place])
     return np.array([m.ravel() for m in np.meshgrid(*lines, indexing="ij")])
-
-
-def layer_width(setting: Setting, points: Array, f: Array, a: Array, axis: int, side: int, cell: float) -> float:
-    """Width of a cell at a limit that noise crosses, at most ``cell``; ``f`` and ``a`` are those across it, there."""
-    inward = np.maximum((1 - 2 * side) * f, 1e-300)
-    with np.errstate(over="ignore"):  # no layer where the drift does not lead inward
-        width = float(np.min(a / (_LAYER * inward)))
-    return max(min(width, cell), _SMALLEST * cell)
 
 
 def _graze(

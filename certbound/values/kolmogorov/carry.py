@@ -7,10 +7,11 @@ below -1 at limits and 0 at other ends of the box), and v(T) >= 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import chain, pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -58,7 +59,10 @@ _FIRST = 12  # steps within that layer
 _GROWTH = {2: 1.15, 3: 1.3}  # of these steps: a front leaves it sharp, and blurs slowly; by the number of states
 _AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
 _OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
-_MARGIN = 0.1  # by which a source exceeds what it pays for
+_MARGIN = 0.1, 0.02  # by which a source exceeds what it pays for: in the first passes, and in those that pay all of it
+_LASTING = 0.5  # share of a slab's source that its neighbours have at least, in the latter: a source that ends at once
+# leaves e a kink in time, and what that leaves moves through the slabs pass by pass
+_RESOLVED = 8.0  # from below exits count from about this times the time in which noise crosses the cell at a limit
 _LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
 _DEEP = 3.0  # cells over which paths are killed, or arrive, at sets within the box
@@ -349,6 +353,19 @@ def _bump(y: Array) -> Array:
     return np.asarray(np.exp(-y * y / 2))
 
 
+def _small(row: Array) -> bool:
+    return bool(np.all(np.abs(row) < _LARGEST))
+
+
+def _lasting(slabs: Sequence[Array]) -> list[Array]:
+    """What is asked for in each slab, and a share of what is in those before and after it."""
+    result = list(slabs)
+    for order in (range(1, len(result)), range(len(result) - 2, -1, -1)):
+        for k in order:
+            result[k] = np.maximum(result[k], _LASTING * result[k - 1 if order.step > 0 else k + 1])
+    return result
+
+
 def _nothing(part: float) -> float:
     return 0.0
 
@@ -593,7 +610,7 @@ class Side:
     @property
     def finite(self) -> bool:
         """Whether every coefficient is a number that no derivative overflows with: nothing is proved of others."""
-        return all(bool(np.all(np.abs(row) < _LARGEST)) for rows in (self.values, self.rates) for row in rows)
+        return all(_small(row) for rows in (self.values, self.rates) for row in rows)
 
     def _goal(self, limit: bool) -> float:
         return 1.0 if self.above else -1.0 if limit else 0.0
@@ -695,15 +712,33 @@ class Side:
         spread = self.setting.spread(self.mesh.inside, self.setting.horizon)[k * len(self.axes) + k]
         return max(cells, float(np.sqrt(max(np.median(spread), 0.0) * self.layer)))
 
+    def _until_resolved(self) -> Array:
+        """At the mesh's nodes: how long before the end exits begin to be counted, from below.
+
+        At a limit the solution has a layer as wide as paths diffuse by then, and cells that are wider than it leave
+        more residual than these exits are worth.
+        """
+        setting, lines, n = self.setting, self.mesh.nodes, len(self.axes)
+        noise = setting.spread(self.mesh.inside, setting.horizon)
+        span = np.full(self.mesh.equation.shape, self.layer)
+        for i in np.flatnonzero(setting.noisy):
+            for side in np.flatnonzero(setting.limited[:, i]):
+                face = tuple(slice(-1 if side else 0, None if side else 1) if k == i else slice(None) for k in range(n))
+                gap = lines[i][-1] - lines[i][-2] if side else lines[i][1] - lines[i][0]
+                crossed = gap**2 / np.maximum(noise[i * n + i][face], 1e-300)
+                span[face] = np.maximum(span[face], _RESOLVED * crossed)
+        return np.asarray(np.minimum(span, setting.horizon - setting.begin))
+
     def propose(self) -> None:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
-        equation, span = self.mesh.equation, self.layer
-        above, limit = self.above, self.mesh.falls
+        equation, above, limit = self.mesh.equation, self.above, self.mesh.falls
+        span = self.layer if above else self._until_resolved()
 
         def fall(tau: float) -> Array | float:
-            if above or tau >= span:
+            if above or tau >= np.max(span):
                 return 0.0
-            return np.asarray(-30 * (tau / span) ** 2 * (1 - tau / span) ** 2 / span * limit * first)
+            passed = np.minimum(tau / span, 1.0)
+            return np.asarray(-30 * (passed * (1 - passed)) ** 2 / span * limit * first)
 
         self.values, self.rates, self.policy, self.passes = [], [], [], 0
         a = self._handed_over()
@@ -733,37 +768,45 @@ class Side:
         self.values.append(sign * (apply_dense(self.maps, a) - 1))
         self.rates.append(-sign * apply_dense(self.maps, speed))
 
-    def residuals(self, rough: bool = False) -> list[Array]:
-        """A bound of v_t + L v on every cell, slab by slab from the end backward; ``rough`` about that, and quicker."""
+    def residuals(self, rough: bool = False, final: Iterable[int] = ()) -> list[Array]:
+        """A bound of v_t + L v on every cell, slab by slab from the end backward; ``rough`` about that, and quicker.
+
+        ``final`` are knots up to which v will not change any more: slabs between them are bounded while it goes on.
+        """
+        count = len(self.steps)
         lattice = int(np.prod([axis.sampling.parts for axis in (self.sketch if rough else self.generator).axes]))
-        many = max(1, _BATCH * len(self.steps) // (lattice * self.own_work))
-        knots: Array | None = None
+        many = max(1, _BATCH * count // (lattice * self.own_work))
         same = all(one is None for one in self.factors)
         _ = (self.sketch, rough or self.generator)  # what the threads share
         if same:
             _ = (self.sketch.images, rough or self.generator.images)
+        begun, knots, slabs = 0, list[Future[Array]](), list[Future[list[Array]]]()
         with ThreadPoolExecutor(2) as pool:
-            if not rough and same:
-                groups = [slice(k, k + many) for k in range(0, len(self.values), many)]
-                knots = np.concatenate(list(pool.map(self._at_knots, groups)))
-            parts = pool.map(lambda k: self._bounded(rough, k, k + many, knots), range(0, len(self.steps), many))
-            return [bound for part in parts for bound in part]
+            for k in final or [count]:
+                while begun < count and k >= min(begun + many, count):
+                    end = min(begun + many, count)
+                    if same and not rough:
+                        knots.append(pool.submit(self._at_knots, slice(begun + (begun > 0), end + 1)))
+                    slabs.append(pool.submit(self._bounded, rough, slice(begun, end), knots[-2:]))
+                    begun = end
+            return [bound for part in slabs for bound in part.result()] if begun == count else []
 
     def _at_knots(self, some: slice[int, int, int]) -> Array:
         return most_at_knots(self.generator, np.array(self.values[some]), np.array(self.rates[some]))
 
-    def _bounded(self, rough: bool, begin: int, end: int, knots: Array | None = None) -> list[Array]:
-        steps = self.steps[begin:end]
-        values, rates = (np.array(rows[begin : begin + len(steps) + 1]) for rows in (self.values, self.rates))
-        factors = [None if one is None else one.on(slice(begin, end)) for one in self.factors]
-        clock = None if self.clock is None else self.clock[begin:end]
+    def _bounded(self, rough: bool, some: slice[int, int, int], proved: Sequence[Future[Array]] = ()) -> list[Array]:
+        """Of some slabs; what is ``proved`` at knots ends with theirs."""
+        steps = self.steps[some]
+        values, rates = (np.array(rows[some.start : some.stop + 1]) for rows in (self.values, self.rates))
+        factors = [None if one is None else one.on(some) for one in self.factors]
+        clock = None if self.clock is None else self.clock[some]
         if rough:
             bound = rough_residual(self.sketch, values, rates, steps, factors, worst=self.above)
         else:
+            knots = np.concatenate([one.result() for one in proved])[-len(values) :] if proved else None
             bound = residual_bound(
-                self.generator, self.sketch, values, rates, steps, factors, worst=self.above, clock=clock,
-                knots=None if knots is None else knots[begin : begin + len(steps) + 1],
-            )  # fmt: skip
+                self.generator, self.sketch, values, rates, steps, factors, worst=self.above, clock=clock, knots=knots
+            )
         done = self._decided(values, rates, steps) | self.stopped
         return list(np.where(done, 0.0, np.maximum(bound, 0.0)))
 
@@ -778,43 +821,70 @@ class Side:
 
     def correct(self, residuals: list[Array]) -> None:
         """Solve for the error that the residuals leave, and for what v lacks at exits and at the end; add it to v."""
+        for _ in self._corrected(residuals):
+            pass
+
+    def corrected(self, residuals: list[Array]) -> list[Array]:
+        """The same; and the residuals that the sum leaves, proved slab by slab while e is being solved for.
+
+        Of a sum that is not finite there are none.
+        """
+        return self.residuals(final=self._corrected(residuals))
+
+    def _corrected(self, residuals: list[Array]) -> Iterator[int]:
+        """Correct v from the end backward: the knots after which it is final, while they are finite."""
         equation, breadth = self.carrier.equation, BREADTHS[min(self.passes, len(BREADTHS) - 1)]
+        paying = breadth is Breadth.ABOVE
         spread = partial(at_nodes, pads=self.carrier.pad, breadth=breadth)
         residuals = [np.zeros_like(r) if brief else r for r, brief in zip(residuals, self.brief)]
+        if paying:
+            residuals = _lasting(residuals)
         slabs = [spread(r) + b for r, b in zip(residuals, self._at_exits(spread, breadth))]
-        ends = [(1 + _MARGIN) * s * equation.live for s in at_knots(slabs, self.steps, breadth)]
+        ends = [(1 + _MARGIN[paying]) * s * equation.live for s in at_knots(slabs, self.steps, breadth)]
         late = self.shortfall_at_end()
         late[self.shapes.cut] = np.maximum(late[self.shapes.cut], self.shortfall_on_edges()[0])
-        missing = (1 + _MARGIN) * spread(late) * equation.live
+        errors = self._errors(ends, (1 + _MARGIN[paying]) * spread(late) * equation.live)
+        if self.passes >= _CALM[self.setting.dimension]:
+            errors = self._calmed(errors)
+        self.passes += 1
+        sound = True
+        for k, (e, speed) in enumerate(errors):
+            self.values[k] = self.values[k] + apply_dense(self.carried_maps, e)
+            self.rates[k] = self.rates[k] - apply_dense(self.carried_maps, speed)
+            sound = sound and _small(self.values[k]) and _small(self.rates[k])
+            if sound:
+                yield k
+
+    def _errors(self, ends: Sequence[Array], missing: Array) -> Iterator[tuple[Array, Array]]:
+        """e and -e_t at the knots from the end backward; ``ends`` holds sources there."""
+        equation = self.carrier.equation
         self._now(self.carrier, 0)
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
-        found, speeds = [e], [equation.speed(e, ends[0])]
+        yield e, equation.speed(e, ends[0])
         for k, step in enumerate(self.steps):
             if not self.brief[k]:
                 e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
             self._now(self.carrier, k + 1)
-            found.append(e)
-            speeds.append(equation.speed(e, ends[k + 1]))
-        if self.passes >= _CALM[self.setting.dimension]:
-            speeds = self._calmed(found, speeds)
-        for k, (e, speed) in enumerate(zip(found, speeds)):
-            self._add(k, e, speed)
-        self.passes += 1
+            yield e, equation.speed(e, ends[k + 1])
 
-    def _calmed(self, found: list[Array], speeds: list[Array]) -> list[Array]:
+    def _calmed(self, errors: Iterable[tuple[Array, Array]]) -> Iterator[tuple[Array, Array]]:
         """Rates of change of e that are divided differences in time where paths leave many cells within a step.
 
         There e follows its source at once. The rate that the equation gives is a difference of two numbers that are
         larger by the number of cells, and so is its error; a cubic in time that has this rate overshoots by as much.
         """
-        times = np.append(0.0, np.cumsum(self.steps))
-        slopes = np.gradient(np.array(found), times, axis=0)
-        longest = np.maximum(np.append(self.steps, 0.0), np.append(0.0, self.steps))
-        result = []
-        for step, speed, slope in zip(longest, speeds, slopes):
-            share = ramp(np.log10(self.carrier.leaving * step + 1e-300) - _MANY)
-            result.append(speed + share * (slope - speed))
-        return result
+        before: tuple[Array, float] | None = None  # the mean rate of the slab before, and its length
+        for k, ((e, speed), (after, _)) in enumerate(pairwise(chain(errors, [(np.zeros(()), np.zeros(()))]))):
+            step = float(self.steps[k]) if k < len(self.steps) else 0.0
+            mean = (after - e) / step if step else None
+            longest = max(step, before[1] if before else 0.0)
+            if before is None or mean is None:
+                slope = mean if mean is not None else before[0] if before is not None else speed
+            else:
+                slope = (before[1] * mean + step * before[0]) / (before[1] + step)
+            share = ramp(np.log10(self.carrier.leaving * longest + 1e-300) - _MANY)
+            yield e, speed + share * (slope - speed)
+            before = None if mean is None else (mean, step)
 
     def _at_exits(self, spread: Callable[..., Array], breadth: Breadth) -> list[Array]:
         """Sources beyond the faces and on them, from which e takes what v lacks there, slab by slab.
@@ -851,7 +921,3 @@ class Side:
                     if not self.setting.noisy[face.axis] and face.place is None:
                         total[k][on] = np.maximum(total[k][on], _ON_FACE * around * carrier.leaving[on])
         return total
-
-    def _add(self, k: int, e: Array, speed: Array) -> None:
-        self.values[k] = self.values[k] + apply_dense(self.carried_maps, e)
-        self.rates[k] = self.rates[k] - apply_dense(self.carried_maps, speed)

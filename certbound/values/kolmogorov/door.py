@@ -23,7 +23,7 @@ from certbound.values.kolmogorov.start_law import StartMean
 from certbound.values.kolmogorov.witness import Witness
 from certbound.watch import poll, seconds_left
 
-_COARSEST = {2: 0.06, 3: 0.1}  # cell of the first grid, as a share of the range
+_COARSEST = {2: 0.08, 3: 0.1}  # cell of the first grid, as a share of the range
 _STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
 _PASSES, _USUAL = 12, 5  # at most, and in most cases
 _AT_LEAST = 8  # where that many serve: to end a little late is better than to have proved nothing
@@ -337,8 +337,8 @@ def refined(
         if stalled and side.above and not lifted:
             side.lift(_LIFT)
             lifted, before = True, math.inf
-        side.correct(residuals)
-        residuals = None
+        residuals = side.corrected(residuals)
+        passes += 1.0
 
 
 def _unpaid(side: Side, residuals: Sequence[Array]) -> tuple[float, float]:
@@ -354,17 +354,18 @@ def _settled(side: Side, enough: float) -> float:
     if side.later is not None:
         rest = _settled(side.later, enough)
         side.propose()
-    unpaid = math.inf
+    unpaid, residuals = math.inf, None
     while True:
         poll("solving for the error that is left of a later stage")
         if not side.finite:
             return math.inf
         rough = side.begun
-        residuals = side.residuals(rough)
+        if residuals is None:
+            residuals = side.residuals(rough)
         unpaid = math.inf if rough else sum(_unpaid(side, residuals))
         if unpaid <= enough or side.passes == _PASSES:
             break
-        side.correct(residuals)
+        residuals = side.corrected(residuals)
     return (rest + unpaid) * (1 + 1e-9)
 
 

@@ -12,7 +12,6 @@ from scipy.linalg import expm
 
 import certbound as cb
 from certbound.values.kolmogorov import bound_failing
-from certbound.values.kolmogorov.axes import layer_width
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import RATE, largest_at_start, refined, starts_in
@@ -210,12 +209,6 @@ def test_passes_end_where_the_work_does() -> None:
     bound, _, passes = refined(side, starts_in(problem), most=2.0)
     assert 2.0 <= passes < 3.0
     assert bound >= truth
-
-
-def test_numbers_of_any_size_plan_a_grid_without_a_warning() -> None:
-    """Where the drift leads outward there is no layer, however large the noise is in its units."""
-    outward, large = np.array([1.0, 2.0]), np.array([1e12, 1e12])
-    assert layer_width(None, None, outward, large, 0, 1, 0.5) == 0.5
 
 
 def test_passes_contract_at_corners_that_paths_leave_within_a_small_part_of_a_step() -> None:
