@@ -407,6 +407,17 @@ def test_a_certificate_that_proves_less_than_safe_is_written_again_with_more_eff
     assert float.fromhex(parse(proved_certificate(problem, verdict))["claim"]["log10_delta"]) <= least
 
 
+def test_boxes_of_the_remainder_are_widened_less_where_a_certificate_would_prove_less_than_safe() -> None:
+    system = cb.ContinuousSystem(lambda x: [x[0] - x[0] ** 3], states=1, diffusion=[[0.13, 0.065]])
+    limit = cb.Inside(cb.Box([-np.inf], [1.144]))
+    problem = cb.Problem(system, initial=[0.0], safe=[limit], horizon=1.0, delta=1.4e-5)
+    verdict = verify_safety(problem, method="linear")
+    assert verdict.status == "SAFE"
+    data = certificate_data(problem, verdict)
+    assert float.fromhex(data["claim"]["log10_delta"]) <= np.log10(problem.delta)
+    assert check_data(parse(json.dumps(data))).valid
+
+
 def test_a_certificate_of_quadratic_bounds_claims_less_than_delta_itself() -> None:
     """The float log10(delta) is above the logarithm of every second delta, and so SAFE seemed not to be shown."""
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.2 * np.eye(2))
