@@ -232,6 +232,34 @@ def test_who_was_only_asked_for_a_certificate_is_asked_once_and_may_fail(monkeyp
     assert asked == ["barrier", "values"]
 
 
+@pytest.mark.parametrize(("proved", "asked"), [(-3.1, False), (-2.9, True)])
+def test_engines_that_only_a_certificate_asks_come_after_the_check_of_what_is_there(
+    monkeypatch: pytest.MonkeyPatch, proved: float, asked: bool
+) -> None:
+    """A claim leaves the checker some room, so that one of more than delta may prove less than that."""
+    calls: list[str] = []
+
+    def silent(*_: Any) -> EngineAnswer:
+        calls.append("asked")
+        return EngineAnswer(applicable=False)
+
+    def refusing(*_: Any) -> Any:
+        raise CertificateError("not today.")
+
+    def proving(data: Any, *_: Any, **__: Any) -> Any:
+        return SimpleNamespace(valid=True, proved=True, log10_proved=proved, log10_lower_proved=None, reason="")
+
+    verdict = verify_safety(small())
+    monkeypatch.setattr("certbound.checker.check_data", proving)
+    for name, row in ENGINES.items():
+        monkeypatch.setitem(ENGINES, name, replace(row, prove=silent, write=refusing))
+    row = replace(ENGINES["linear"], write=lambda *_: ({"engine": "linear"}, -2.8, []))
+    monkeypatch.setitem(ENGINES, "linear", row)
+    data = parse(proved_certificate(small(), verdict))
+    assert float.fromhex(data["claim"]["log10_delta"]) == pytest.approx(proved, abs=1e-4)
+    assert bool(calls) == asked
+
+
 def test_engines_on_grids_are_asked_for_a_certificate_after_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 

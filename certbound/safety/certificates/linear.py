@@ -154,8 +154,8 @@ def _search(
 ) -> Stated | None:
     """The first share's proof that reaches the target, or the best one found, with the widest boxes that do.
 
-    Wide boxes are quick to check; narrower ones are tried where these do not close, or (``closely``) prove less than the
-    target.
+    Wide boxes are quick to check; narrower ones are tried where these do not close, or (``closely``) prove less than
+    the target.
     """
     best: Stated | None = None
     enough = target.log - _slack(target.log / _LOG10) * _LOG10
