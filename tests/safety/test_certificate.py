@@ -446,6 +446,31 @@ def test_boxes_of_the_remainder_are_widened_less_where_a_certificate_would_prove
     assert check_data(parse(json.dumps(data))).valid
 
 
+def test_grids_of_steps_have_no_more_cells_than_the_checker_takes() -> None:
+    system = cb.DiscreteSystem(lambda x: [0.5 * x[0], 0.5 * x[1]], states=2, noise=cb.Gaussian(std=[0.01, 0.01]))
+    safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
+    problem = cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=1, delta=0.01)
+    verdict = verify_safety(problem, method="values")
+    for attempt, few in ((0, 5e4), (2, 1e5)):
+        (grid,) = certificate_data(problem, verdict, attempt=attempt)["proof"]["grids"]
+        assert few / 2 < np.prod([len(axis) - 1 for axis in grid]) <= few
+
+
+def test_noise_that_states_share_is_stated_in_pieces() -> None:
+    """Polynomials the checker refused after all was written, since it has them for independent noise alone."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.5 * x[0], 0.5 * x[1]], states=2, noise=cb.Gaussian(std=[1, 1]),
+        noise_matrix=[[0.1, 0.05], [0.0, 0.1]],
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
+    problem = cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=2, delta=0.05)
+    verdict = verify_safety(problem, method="values")
+    assert verdict.status == "SAFE"
+    data = parse(proved_certificate(problem, verdict))
+    assert data["proof"]["pieces"] > 0
+    assert is_at_most(float.fromhex(data["claim"]["log10_delta"]), 0.05)
+
+
 def test_a_certificate_of_quadratic_bounds_claims_less_than_delta_itself() -> None:
     """The float log10(delta) is above the logarithm of every second delta, and so SAFE seemed not to be shown."""
     system = cb.ContinuousSystem(lambda x: [-x[0], -x[1]], states=2, diffusion=0.2 * np.eye(2))
