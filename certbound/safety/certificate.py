@@ -49,9 +49,14 @@ def certificate_text(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     return certificate_of(problem, verdict, attempt=attempt)[0]
 
 
-def certificate_of(problem: Problem, verdict: Answered, *, attempt: int = 0) -> tuple[str, str]:
-    """The same, and the engine whose proof it states; empty where it is made of several certificates."""
-    data, engine = _certified(problem, verdict, attempt)
+def certificate_of(
+    problem: Problem, verdict: Answered, *, attempt: int = 0, reserves: bool = True
+) -> tuple[str, str]:
+    """The same, and the engine whose proof it states; empty where it is made of several certificates.
+
+    Without ``reserves`` no engine is asked that had not answered.
+    """
+    data, engine = _certified(problem, verdict, attempt, reserves=reserves)
     return json.dumps(data, separators=(",", ":")) + "\n", engine
 
 
@@ -96,14 +101,16 @@ def certificate_data(problem: Problem, verdict: Answered, *, attempt: int = 0) -
     return _certified(problem, verdict, attempt)[0]
 
 
-def _certified(problem: Problem, verdict: Answered, attempt: int) -> tuple[dict[str, Any], str]:
+def _certified(
+    problem: Problem, verdict: Answered, attempt: int, *, reserves: bool = True
+) -> tuple[dict[str, Any], str]:
     """The certificate, and the engine whose proof it states."""
     refuse_moving_limits(problem, verdict)
     members, cells = getattr(verdict, "members", ()), getattr(verdict, "cells", ())
     if problem.random and not members:
         if verdict.status == "UNSAFE":
             raise CertificateError("certificates state no lower bounds where constants are drawn.")
-        return averaged(problem, cells, [_stated(one, attempt) for one in cells]), ""
+        return averaged(problem, cells, [_stated(one, attempt, reserves) for one in cells]), ""
     if verdict.status == "UNSAFE" or any(one.status == "UNSAFE" for one in members):
         try:
             return _lower_data(problem, verdict, attempt)
@@ -111,10 +118,10 @@ def _certified(problem: Problem, verdict: Answered, attempt: int) -> tuple[dict[
             if not _cannot_be_written(problem, verdict):
                 raise
     if members:
-        return united(problem, [certificate_data(one.problem, one, attempt=attempt) for one in members]), ""
+        return united(problem, [_certified(one.problem, one, attempt, reserves=reserves)[0] for one in members]), ""
     refusals: list[str] = []
     best: tuple[str, Proof] | None = None
-    for name, answer in _answers(problem, verdict):
+    for name, answer in _answers(problem, verdict, reserves):
         try:
             write = ENGINES[name].write
             if write is None:
@@ -151,10 +158,10 @@ def refuse_moving_limits(problem: Problem, verdict: Answered | None = None) -> N
     )
 
 
-def _stated(cell: Any, attempt: int) -> dict[str, Any] | None:
+def _stated(cell: Any, attempt: int, reserves: bool) -> dict[str, Any] | None:
     """The certificate of a cell of drawn constants; None where there is none."""
     try:
-        return certificate_data(cell.plain, cell.verdict, attempt=attempt) if cell.asked else None
+        return _certified(cell.plain, cell.verdict, attempt, reserves=reserves)[0] if cell.asked else None
     except CertificateError:
         return None
 
@@ -245,21 +252,23 @@ def _whole(problem: Problem, claim: dict[str, Any], proof: dict[str, Any]) -> di
     return {"format": FORMAT, "version": VERSION, "claim": claim, "problem": data, "proof": proof}
 
 
-def _answers(problem: Problem, verdict: Answered) -> Iterator[tuple[str, EngineAnswer]]:
-    """Engines that bounded a probability, the best first; then those in reserve that were not asked.
+def _answers(problem: Problem, verdict: Answered, reserves: bool) -> Iterator[tuple[str, EngineAnswer]]:
+    """Engines that bounded a probability, the best first; then those in reserve that were not asked (``reserves``).
 
     What a certificate states can be weaker than what its engine proved, so that another engine's may be needed.
     """
     useful = [item for item in verdict.answers.items() if item[1].applicable and item[1].log10_delta < 0]
     yield from sorted(useful, key=lambda item: (not item[1].certified, item[1].log10_delta))
-    reserves = _Reserves(problem, verdict, _RESERVED, Request(above=True))
+    if not reserves:
+        return
+    kept = _Reserves(problem, verdict, _RESERVED, Request(above=True))
     # on grids an engine does all the work that it may: those that soon say what they can come first
     for name, row in sorted(ENGINES.items(), key=lambda item: item[1].dear and not item[1].soon):
         asked = verdict.answers.get(name)
         if problem.reach is not None or verdict.status != "SAFE" or asked is None or asked.applicable:
             continue
         if row.reserve and row.write:
-            answer = reserves.ask(name)
+            answer = kept.ask(name)
             if answer.applicable and answer.log10_delta < 0:
                 yield name, answer
 

@@ -232,6 +232,34 @@ def test_who_was_only_asked_for_a_certificate_is_asked_once_and_may_fail(monkeyp
     assert asked == ["barrier", "values"]
 
 
+@pytest.mark.parametrize(("proved", "asked"), [(-3.1, False), (-2.9, True)])
+def test_engines_that_only_a_certificate_asks_come_after_the_check_of_what_is_there(
+    monkeypatch: pytest.MonkeyPatch, proved: float, asked: bool
+) -> None:
+    """A claim leaves the checker some room, so that one of more than delta may prove less than that."""
+    calls: list[str] = []
+
+    def silent(*_: Any) -> EngineAnswer:
+        calls.append("asked")
+        return EngineAnswer(applicable=False)
+
+    def refusing(*_: Any) -> Any:
+        raise CertificateError("not today.")
+
+    def proving(data: Any, *_: Any, **__: Any) -> Any:
+        return SimpleNamespace(valid=True, proved=True, log10_proved=proved, log10_lower_proved=None, reason="")
+
+    verdict = verify_safety(small())
+    monkeypatch.setattr("certbound.checker.check_data", proving)
+    for name, row in ENGINES.items():
+        monkeypatch.setitem(ENGINES, name, replace(row, prove=silent, write=refusing))
+    row = replace(ENGINES["linear"], write=lambda *_: ({"engine": "linear"}, -2.8, []))
+    monkeypatch.setitem(ENGINES, "linear", row)
+    data = parse(proved_certificate(small(), verdict))
+    assert float.fromhex(data["claim"]["log10_delta"]) == pytest.approx(proved, abs=1e-4)
+    assert bool(calls) == asked
+
+
 def test_engines_on_grids_are_asked_for_a_certificate_after_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
@@ -405,6 +433,42 @@ def test_a_certificate_that_proves_less_than_safe_is_written_again_with_more_eff
     least = np.log10(problem.delta)
     assert float.fromhex(certificate_data(problem, verdict)["claim"]["log10_delta"]) > least
     assert float.fromhex(parse(proved_certificate(problem, verdict))["claim"]["log10_delta"]) <= least
+
+
+def test_boxes_of_the_remainder_are_widened_less_where_a_certificate_would_prove_less_than_safe() -> None:
+    system = cb.ContinuousSystem(lambda x: [x[0] - x[0] ** 3], states=1, diffusion=[[0.13, 0.065]])
+    limit = cb.Inside(cb.Box([-np.inf], [1.144]))
+    problem = cb.Problem(system, initial=[0.0], safe=[limit], horizon=1.0, delta=1.4e-5)
+    verdict = verify_safety(problem, method="linear")
+    assert verdict.status == "SAFE"
+    data = certificate_data(problem, verdict)
+    assert float.fromhex(data["claim"]["log10_delta"]) <= np.log10(problem.delta)
+    assert check_data(parse(json.dumps(data))).valid
+
+
+def test_grids_of_steps_have_no_more_cells_than_the_checker_takes() -> None:
+    system = cb.DiscreteSystem(lambda x: [0.5 * x[0], 0.5 * x[1]], states=2, noise=cb.Gaussian(std=[0.01, 0.01]))
+    safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
+    problem = cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=1, delta=0.01)
+    verdict = verify_safety(problem, method="values")
+    for attempt, few in ((0, 5e4), (2, 1e5)):
+        (grid,) = certificate_data(problem, verdict, attempt=attempt)["proof"]["grids"]
+        assert few / 2 < np.prod([len(axis) - 1 for axis in grid]) <= few
+
+
+def test_noise_that_states_share_is_stated_in_pieces() -> None:
+    """Polynomials the checker refused after all was written, since it has them for independent noise alone."""
+    system = cb.DiscreteSystem(
+        lambda x: [0.5 * x[0], 0.5 * x[1]], states=2, noise=cb.Gaussian(std=[1, 1]),
+        noise_matrix=[[0.1, 0.05], [0.0, 0.1]],
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1.0, -1.0], [1.0, 1.0]))]
+    problem = cb.Problem(system, initial=[0.0, 0.0], safe=safe, horizon=2, delta=0.05)
+    verdict = verify_safety(problem, method="values")
+    assert verdict.status == "SAFE"
+    data = parse(proved_certificate(problem, verdict))
+    assert data["proof"]["pieces"] > 0
+    assert is_at_most(float.fromhex(data["claim"]["log10_delta"]), 0.05)
 
 
 def test_a_certificate_of_quadratic_bounds_claims_less_than_delta_itself() -> None:

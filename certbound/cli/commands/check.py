@@ -29,6 +29,7 @@ EXAMPLES = examples(
     "certbound check stated.json --allow-assumptions",
 )
 ATTEMPTS = 3
+_Found = tuple[float, str]  # log10 of what was proved, and the certificate
 
 CertificateArgument = Annotated[
     Path, typer.Argument(metavar="CERT", help="The file of verify --certificate.", show_default=False)
@@ -93,8 +94,9 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     """The text of a verdict's certificate, which the checker has proved again; it claims what was proved.
 
     Assumptions of the verdict are assumptions of the certificate, which names them. Where the checker proves no
-    certificate of one engine, at any effort, the other engines' are tried. CertificateError where the verdict bounds no
-    probability, or the checker did not prove what was written. ``checking`` takes the seconds of every check.
+    certificate of one engine, at any effort, the other engines' are tried; engines that had not been asked come last,
+    where what is proved says less than SAFE. CertificateError where the verdict bounds no probability, or the checker
+    did not prove what was written. ``checking`` takes the seconds of every check.
     """
     spent = [] if checking is None else checking
     if verdict.members and not any(member.status == "UNSAFE" for member in verdict.members):
@@ -102,18 +104,26 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
     if problem.random:
         return _at_once(problem, verdict, spent) or _whole_again(problem, _averaged(problem, verdict, spent), spent)
     left, reasons = dict(verdict.answers), list[str]()
-    while left:
-        try:
-            found, engine, reason = _proved(problem, replace(verdict, answers=left), spent)
-        except EngineError as error:
-            if not reasons:
-                raise CertificateError(str(error)) from error
+    best: _Found | None = None
+    for reserves in (False, True) if verdict.status == "SAFE" else (True,):
+        while left:
+            try:
+                own = replace(verdict, answers=left)
+                found, engine, reason = _proved(problem, own, spent, best, reserves=reserves)
+            except EngineError as error:
+                if reserves and not reasons and best is None:
+                    raise CertificateError(str(error)) from error
+                break
+            if found is not None:
+                best = found
+                break
+            reasons.append(f"{engine}: {reason}")
+            if left.pop(engine, None) is None:
+                break
+        if best is not None and _is_enough(problem, verdict, best[0]):
             break
-        if found is not None:
-            return found
-        reasons.append(f"{engine}: {reason}")
-        if left.pop(engine, None) is None:
-            break
+    if best is not None:
+        return best[1]
     if not reasons:
         raise CertificateError(f"no probability was bounded that a certificate could state: {verdict.reason}")
     raise CertificateError(f"no certificate could be proved again by the checker: {' '.join(reasons)}")
@@ -122,11 +132,11 @@ def proved_certificate(problem: Problem, verdict: Verdict, checking: list[float]
 def _at_once(problem: Problem, verdict: Verdict, checking: list[float]) -> str | None:
     """The certificate made of those of its parts, checked as a whole alone; None where that does not settle delta."""
     from certbound.checker import parse
-    from certbound.safety.certificate import restated
+    from certbound.safety.certificate import certificate_of, restated
 
     try:
         with contained("certificate"):
-            text = verdict.certificate_text(problem)
+            text = certificate_of(problem, verdict, reserves=False)[0]
         report = _checked(problem, parse(text), checking)
     except (EngineError, CertificateError):
         return None
@@ -204,22 +214,25 @@ def _may_be_claimed(problem: Problem, verdict: Verdict, report: Report) -> bool:
     return most is not None and verdict.status == "SAFE" and _is_enough(problem, verdict, most)
 
 
-def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[str | None, str, str]:
+def _proved(
+    problem: Problem, verdict: Verdict, checking: list[float], best: _Found | None, *, reserves: bool
+) -> tuple[_Found | None, str, str]:
     """A certificate that the checker has proved (None: it proved none), its engine, and what stood in the way.
 
-    Where SAFE was proved and it says less than that, more effort is spent, and the best one is kept. It claims what was
-    proved, also where the writer had claimed more, if that shows what the verdict says. A claim of less than is proved
-    already is not checked. EngineError where no certificate could be written.
+    Where SAFE was proved and it says less than that, more effort is spent, and the best one is kept, that of before
+    included. It claims what was proved, also where the writer had claimed more, if that shows what the verdict says. A
+    claim of less than is proved already is not checked. EngineError where no certificate could be written.
     """
     from certbound.checker import parse
     from certbound.safety.certificate import certificate_of, restated
 
     engine = reason = text = ""
-    best: tuple[float, str, str] | None = None
     for attempt in range(ATTEMPTS):
         try:
             with contained("certificate"):
-                before, (text, engine) = text, certificate_of(problem, verdict, attempt=attempt)
+                before, (text, engine) = text, certificate_of(
+                    problem, verdict, attempt=attempt, reserves=reserves
+                )
         except EngineError as error:
             if attempt + 1 == ATTEMPTS and not text:
                 raise
@@ -239,14 +252,14 @@ def _proved(problem: Problem, verdict: Verdict, checking: list[float]) -> tuple[
         least, most = report.log10_lower_proved, report.log10_proved
         holds = _may_be_claimed(problem, verdict, report)
         if least is not None and holds:
-            return restated(text, least, lower=True), engine, ""
+            return (0.0, restated(text, least, lower=True)), engine, ""
         if most is not None and holds:
-            found = most, restated(text, most), engine
+            found = most, restated(text, most)
             best = found if best is None else min(best, found)
             if _is_enough(problem, verdict, most):
                 break
         reason = report.reason
-    return (None, engine, reason) if best is None else (*best[1:], "")
+    return best, engine, reason
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.errors import EngineError
+from certbound.rigor.rounding import quiet
 from certbound.watch import poll
 
 _UNIT = 2.0**-53
@@ -70,8 +71,9 @@ class LinearResponse:
         """Lower and upper bounds of the variances r V r^T of ``rows`` (B, M, n) at ``nodes`` (M,)."""
         return self.covariance_of(rows, rows, nodes)
 
+    @quiet
     def covariance_of(self, first: Array, second: Array, nodes: Integers) -> tuple[Array, Array]:
-        """Bounds of cov(first Z, second Z) at ``nodes``; rows (B, M, n)."""
+        """Bounds of cov(first Z, second Z) at ``nodes``; rows (B, M, n). Where numbers overflow they are infinite."""
         n = first.shape[-1]
         used = np.flatnonzero((first != 0).any(axis=(0, 1)) | (second != 0).any(axis=(0, 1)))
         if 2 * len(used) < n:  # zero entries add nothing
@@ -86,7 +88,8 @@ class LinearResponse:
             "bmi,bmij,bmj->bm", abs(r), abs(w), abs(r)) for r in (first, second)]
         roots = [np.sqrt(np.maximum(square, 0)) for square in own]  # of the factors: their product may pass all floats
         error = roots[0] * roots[1] * (1 + 1e-12) + rounding + TINY
-        return value - error, value + error
+        low, high = value - error, value + error
+        return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
 
 
 def _transition(slope: Array, drift: Array, step: float, slope_error: float) -> tuple[Array, Array, Array]:
@@ -103,7 +106,7 @@ def _transition(slope: Array, drift: Array, step: float, slope_error: float) -> 
         total += newer
     # beyond the last term the majorant falls by this ratio at least every second term
     ratio = (alpha + kappa) / _TERMS
-    if np.any(ratio > 0.5):
+    if not np.all(ratio <= 0.5):
         raise _too_stiff(float((alpha + kappa).max()))
     tail = 4.1 * (big + small) * np.maximum(ratio, TINY)
     growth = np.exp(alpha + kappa) * (1 + 1e-13)
@@ -138,7 +141,7 @@ def _noise_covariance(slope: Array, drift: Array, step: float, gram: Array) -> t
         small, big = big, (alpha * big + kappa * small) / (i + 1)
         total = total + newer
     ratio = (alpha + kappa) / _TERMS
-    if np.any(ratio > 0.5):
+    if not np.all(ratio <= 0.5):
         raise _too_stiff(float((alpha + kappa).max()) / 2)
     scale = _norm(gram) * step
     error = (4.1 * (big + small) * np.maximum(ratio, TINY)
@@ -159,24 +162,37 @@ def _propagate(
     if start_error is not None:
         w[:, 0] += np.diag(start_error.sum(axis=-1) * (1 + gamma(n)))
     eye = np.eye(n)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(pieces):
-            poll()
-            f, phi = transition[:, k], transition_error[:, k]
-            product = f @ v[:, k] @ _transposed(f) + noise[:, k]
-            v[:, k + 1] = (product + _transposed(product)) / 2
-            size_f, size_v, size_w = _norm(f), _norm(v[:, k]), _norm(w[:, k])
-            columns = _norm(_transposed(f))
-            spread = n * phi * (size_f + columns + n * phi)
-            rounding = 2 * gamma(2 * n + 4) * (size_f * columns * (size_v + size_w) + _norm(v[:, k + 1]))
-            residual = n * (rounding + noise_error[:, k]) + n * spread * (size_v + size_w)
-            grown = f @ w[:, k] @ _transposed(f)
-            w[:, k + 1] = (grown + _transposed(grown)) / 2 + (residual * (1 + 1e-10) + TINY)[:, None, None] * eye
-    if not (np.isfinite(v).all() and np.isfinite(w).all()):
-        raise EngineError(
-            "the deviation of the linearised system grows beyond all floats before the horizon; shorten the horizon."
-        )
+    for k in range(pieces):
+        poll()
+        f, phi = transition[:, k], transition_error[:, k]
+        product = f @ v[:, k] @ _transposed(f) + noise[:, k]
+        v[:, k + 1] = (product + _transposed(product)) / 2
+        size_f, size_v, size_w = _norm(f), _norm(v[:, k]), _norm(w[:, k])
+        columns = _norm(_transposed(f))
+        spread = n * phi * (size_f + columns + n * phi)
+        rounding = 2 * gamma(2 * n + 4) * (size_f * columns * (size_v + size_w) + _norm(v[:, k + 1]))
+        residual = n * (rounding + noise_error[:, k]) + n * spread * (size_v + size_w)
+        grown = f @ w[:, k] @ _transposed(f)
+        w[:, k + 1] = (grown + _transposed(grown)) / 2 + (residual * (1 + 1e-10) + TINY)[:, None, None] * eye
     return v, w
+
+
+def _finite(response: LinearResponse) -> LinearResponse:
+    """The response; what overflowed says nothing of what it bounds.
+
+    Raises
+    ------
+    EngineError
+        If some number of it is beyond all floats.
+    """
+    parts = (response.transition, response.transition_error, response.deviation, response.covariance,
+             response.covariance_error)  # fmt: skip
+    if not all(np.isfinite(part).all() for part in parts):
+        raise EngineError(
+            "the response of the linearised system grows beyond all floats before the horizon, or what its rounding "
+            "may cost does; shorten the horizon, or rescale the states."
+        )
+    return response
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -191,6 +207,7 @@ class Jumps:
     error: float
 
 
+@quiet
 def continuous_response(
     slope: Array, drift: Array, step: float, diffusion: Array, start: Array, *, slope_error: float = 0.0,
     jumps: Jumps | None = None, start_error: Array | None = None,
@@ -221,12 +238,12 @@ def continuous_response(
         deviation[:, own] = 0.0
     v, w = _propagate(
         transition, error, noise, noise_error, start / size, None if start_error is None else start_error / size)
-    return LinearResponse(
+    return _finite(LinearResponse(
         step=step, slope=slope, drift=drift, transition=transition * back, transition_error=error * float(back.max()),
         deviation=deviation * back + TINY, covariance=v * size, slope_error=slope_error,
         covariance_error=w * size + len(unit) * TINY * np.eye(len(unit)),
         jumps=() if jumps is None else jumps.places,
-    )
+    ))
 
 
 def _balancing_units(slopes: Array) -> Array:
@@ -255,6 +272,7 @@ def balanced(slopes: Array) -> Array:
     return np.asarray(slopes / units[:, None] * units)
 
 
+@quiet
 def discrete_response(
     slope: Array, covariance: Array, covariance_bound: float, start: Array, *, slope_error: float = 0.0,
     start_error: Array | None = None,
@@ -265,7 +283,7 @@ def discrete_response(
     none = np.full((cells, steps), slope_error)
     v, w = _propagate(slope, none, noise, np.zeros_like(none) + covariance_bound, start, start_error)
     zero = np.zeros_like(slope)
-    return LinearResponse(
+    return _finite(LinearResponse(
         step=1.0, slope=slope, drift=zero, transition=slope, transition_error=none,
         deviation=zero, covariance=v, covariance_error=w, slope_error=slope_error,
-    )
+    ))

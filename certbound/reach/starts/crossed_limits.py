@@ -21,6 +21,7 @@ from certbound.problem.sets import Faces, Inside, Quadratic
 from certbound.reach.starts.drawn_paths import StartPaths
 from certbound.rigor.definite import is_positive_definite
 from certbound.rigor.intervals import Interval
+from certbound.rigor.rounding import quiet
 
 _POINTS = (0.0, 0.25, 0.5, 0.75)  # of every piece, at which breaking is looked for; and the end of the last
 _NUMBERS = 2_000_000  # numbers of a chunk of cells, pieces, points, coordinates and directions
@@ -87,17 +88,22 @@ class Limit:
             return self.points
         return self.points.chosen(self.room(self.points, *_hull(middle, half))[0] < 0)
 
+    @quiet
     def rooms(self, middle: Array, half: Array) -> Array:
         """Lower bounds of the room that every face of a set to stay in leaves on every piece, (B, M, faces)."""
         assert isinstance(self.form, Faces)
         spread = np.einsum("mckd,bd->bmck", np.abs(self.pieces.gains), half) + self._rest(self.pieces)
         high = (self.pieces.at(middle) + spread).max(axis=2) + self.pieces.slack
-        return np.asarray(self.form.bounds - high)
+        return _known(self.form.bounds - high)
 
     # ---- keeping -------------------------------------------------------------------------------------------------
 
+    @quiet
     def room(self, pieces: _Points, middle: Array, half: Array) -> Array:
         """Lower bounds of the room that every piece leaves, (B, M): not negative where the constraint is kept."""
+        return _known(self._room(pieces, middle, half))
+
+    def _room(self, pieces: _Points, middle: Array, half: Array) -> Array:
         place = pieces.at(middle)
         if isinstance(self.form, Faces):
             spread = np.einsum("mckd,bd->bmck", np.abs(pieces.gains), half) + self._rest(pieces)
@@ -112,11 +118,16 @@ class Limit:
         low = np.einsum("bmck,bmk->bmc", place, toward) - self._along(pieces, toward, half)
         return _positive(low.min(axis=-1) - (np.abs(toward) * pieces.slack).sum(axis=-1) - self.radius[1])
 
+    @quiet
     def breaks(self, points: _Points, middle: Array, half: Array) -> Array:
         """Lower bounds of how far all of a cell is beyond the constraint at every point, (B, M): positive where it is.
 
         At an obstacle also 0 breaks, and counts as positive.
         """
+        beyond = self._beyond(points, middle, half)
+        return np.where(np.isfinite(beyond), beyond, -np.inf)  # a distance that overflows proves nothing
+
+    def _beyond(self, points: _Points, middle: Array, half: Array) -> Array:
         place = points.at(middle)
         if isinstance(self.form, Faces):
             spread = np.einsum("mckd,bd->bmck", np.abs(points.gains), half) + self._rest(points)
@@ -132,6 +143,7 @@ class Limit:
         low = size[..., 0] * (1 - _ROUND) - self._along(points, toward, half)[..., 0]
         return np.asarray(low - (np.abs(toward) * points.slack).sum(axis=-1) - self.radius[1] * (1 + _ROUND))
 
+    @quiet
     def effects(self, piece: _Points, middle: Array, half: Array) -> Array:
         """How much each direction of a cell hides whether the piece of its number keeps the constraint: (B, d)."""
         place = (piece.value + np.einsum("bckd,bd->bck", piece.gains, middle)).mean(axis=1)
@@ -179,6 +191,11 @@ def _hull(middle: Array, half: Array) -> tuple[Array, Array]:
     low, high = (middle - half).min(axis=0), (middle + half).max(axis=0)
     centre = (low + high) / 2
     return centre[None], np.maximum(high - centre, centre - low)[None] * (1 + 1e-15) + 1e-15 * np.abs(centre)
+
+
+def _known(room: Array) -> Array:
+    """Numbers that overflowed leave no room: they are no numbers, which would compare with nothing."""
+    return np.where(np.isnan(room), -np.inf, room)
 
 
 def _positive(values: Array) -> Array:

@@ -14,6 +14,7 @@ from certbound.arrays import Array
 from certbound.reach.linear import Linearisation, LinearRun
 from certbound.reach.starts.drawn_directions import FAR, StartDirections
 from certbound.rigor.intervals import Interval
+from certbound.rigor.rounding import quiet
 
 _ROUND = 1e-13  # of all terms' sizes: more than a few dozen products and sums lose
 _TRIES = 20
@@ -48,6 +49,7 @@ def node_maps(engine: Linearisation) -> Array:
     return np.stack(found)
 
 
+@quiet
 def start_paths(engine: Linearisation, start: StartDirections) -> StartPaths:
     """Enclose every path of a linear model from a start by its directions (Thm K7 without noise).
 
@@ -76,8 +78,8 @@ def start_paths(engine: Linearisation, start: StartDirections) -> StartPaths:
         if np.all(sizes + error <= whole):
             break
         whole = 2 * (sizes + error)
-    else:
-        raise ArithmeticError("the paths grow beyond what floats bear; shorten the horizon.")
+    if not (np.isfinite(whole).all() and np.all(sizes + error <= whole)):  # infinite sizes would bound each other
+        raise _unbearable()
     error = error + np.abs(support.response.initial[:, support.response.place[:n]]) @ start.slack
     if not continuous:
         ends, off = nodes[:count, None], error[:count]
@@ -87,7 +89,17 @@ def start_paths(engine: Linearisation, start: StartDirections) -> StartPaths:
         bulge = np.einsum("kij,kj->ki", support.gathering.curve, whole[:-1])
         off = np.maximum(error[:-1], error[1:]) + bulge * (1 + _ROUND)
     size = np.abs(controls).max(axis=1) + (np.abs(ends) @ weights).max(axis=1)
+    slack = off + moved + _ROUND * size
+    if not all(np.isfinite(part).all() for part in (controls, ends, slack, size)):
+        raise _unbearable()
     return StartPaths(
-        controls=controls, gains=ends[..., :d], rest=ends[..., d:], slack=off + moved + _ROUND * size, size=size,
+        controls=controls, gains=ends[..., :d], rest=ends[..., d:], slack=slack, size=size,
         span=engine.nominal(0).span(), reach=start.reach,
     )  # fmt: skip
+
+
+def _unbearable() -> ArithmeticError:
+    return ArithmeticError(
+        "the paths, or what their rounding may cost, grow beyond what floats bear; shorten the horizon, or rescale the "
+        "states."
+    )

@@ -32,7 +32,8 @@ Events = StepEvents | WindowEvents
 _STEPS = (0.25, 0.12, 0.06)
 _FEWEST, _MOST = 40, (160, 320, 640)
 EFFORTS = len(_STEPS)
-PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))  # a smaller one where a larger does not close
+PADS = ((0.08, 0.03, 0.01), (0.15, 0.05, 0.02), (0.25, 0.1, 0.03))
+"""How much boxes are widened, effort by effort: a smaller one where a larger does not close, or costs too much."""
 _NEARLY = 1.3
 _LEAST = 1e-5  # of a row's largest level: along a singular start Z has but what its covariance was raised by
 _ROUNDS = 8
@@ -52,13 +53,14 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
     found = answer.details
     engine = engine_of(answer)
     target = Share.of(problem.delta)
+    proved = found.outcome.log_probability <= target.log
     tried = [found.outcome.nonlinear, found.shown.nonlinear, target.stated()]
     if not len(engine.model.active):  # only windows ask for a share
         tried.insert(0, Share(found.outcome.log_probability).stated(linear=True))
     best: tuple[LinearRun, Stated] | None = None
     for grid in grids(engine, effort):
         run = found.run if grid is found.run.engine else LinearRun(grid)
-        stated = _search(run, list(dict.fromkeys(tried)), PADS[effort], target)
+        stated = _search(run, list(dict.fromkeys(tried)), PADS[effort], target, closely=proved)
         if stated is not None and (best is None or stated.log_probability < best[1].log_probability):
             best = run, stated
         if best is not None and best[1].log_probability <= _NEAR * found.outcome.log_probability:
@@ -67,8 +69,13 @@ def linear_proof(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Pr
         raise CertificateError("the remainder feeds itself once its boxes are widened for the checker.")
     log10 = max(best[1].log_probability / _LOG10, _SMALLEST)
     exact_sums = not engine.continuous and effort == 0 and log10 > _LIKELY
-    slack = SLACK * (0.01 if exact_sums else 1 + 0.1 * abs(log10))
+    slack = _slack(log10) * (0.01 if exact_sums else 1)
     return proof_data(best[0].engine.problem, *best, cuts_of(answer)), min(log10 + slack, 0.0), []
+
+
+def _slack(log10: float) -> float:
+    """What a claim leaves to the checker's own bounds of events."""
+    return SLACK * (1 + 0.1 * abs(log10))
 
 
 def engine_of(answer: EngineAnswer) -> Linearisation:
@@ -142,25 +149,31 @@ class _Levels:
     found: tuple[Array, Array]
 
 
-def _search(run: LinearRun, shares: list[Share], pads: Sequence[float], target: Share) -> Stated | None:
-    """The first share's proof that reaches the target, or the best one found, with the widest boxes that close.
+def _search(
+    run: LinearRun, shares: list[Share], pads: Sequence[float], target: Share, *, closely: bool
+) -> Stated | None:
+    """The first share's proof that reaches the target, or the best one found, with the widest boxes that do.
 
-    Wide boxes are quick to check.
+    Wide boxes are quick to check; narrower ones are tried where these do not close, or (``closely``) prove less than
+    the target.
     """
     best: Stated | None = None
+    enough = target.log - _slack(target.log / _LOG10) * _LOG10
     for share in shares:
         given = _levels(run, share)
         if given is None:
             continue
-        closed = (widened(run, given.levels, given.found, pad) for pad in pads)
-        bounds = next((found for found in closed if found is not None), None)
-        if bounds is None:
-            continue
-        stated = _stated(run, given, bounds)
-        if best is None or stated.log_probability < best.log_probability:
-            best = stated
-        if best.log_probability <= target.log:
-            break
+        for pad in pads:
+            bounds = widened(run, given.levels, given.found, pad)
+            if bounds is None:
+                continue
+            stated = _stated(run, given, bounds)
+            if best is None or stated.log_probability < best.log_probability:
+                best = stated
+            if best.log_probability <= enough:
+                return best
+            if not closely:
+                break
     return best
 
 

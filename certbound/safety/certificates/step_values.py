@@ -46,6 +46,7 @@ _NARROW = 1e-6  # half of a cell at a jump, of the length of an axis: with less 
 _SLIVER = 1e-6  # of the length of an axis
 _MOST_LOOKS = 5e7  # cells, times pieces of the noise, times steps, in two states: about a minute of the checker
 _MOST_STEPS = 2000  # that the checker looks at
+_MOST_CELLS, _COARSENED = 99_000, 8  # of a grid: the checker takes 100 000, and at jumps there are some more
 _MORE = 1.25  # times the steps after which the engine's bounds were close
 
 
@@ -103,9 +104,9 @@ def _check_pieces(problem: Problem, answer: EngineAnswer, lower: bool) -> None:
     at_last = (3 * 10 ** (found or 0.0) + (coarse.lower if lower else coarse.upper)) / 4
     if at_last < level if lower else at_last > level:
         raise CertificateError(
-            "in two states the checker knows noise that the state multiplies, or that has one direction, by functions "
-            f"that are constant on cells, which on its finest grid would say about {at_last:.2g}, not {level:.2g}; the "
-            "bound stands without a certificate."
+            "in two states the checker knows noise that the state multiplies, or that is not independent from state to "
+            "state, by functions that are constant on cells, which on its finest grid would say about "
+            f"{at_last:.2g}, not {level:.2g}; the bound stands without a certificate."
         )
 
 
@@ -138,7 +139,7 @@ def _grids(problem: Problem, effort: int, steps: int) -> tuple[list[Grid], int]:
     try:
         law, shares = _law_of(problem), _SHARES[problem.system.dimension]
         share = (shares if law.gaussian else _UNIFORM_SHARES)[effort]
-        grids = step_grids(problem, share, _MOST_STEPS)
+        grids = _fitting(problem, share)
         return (grids if len(grids) > 1 else grids * (steps + 1))[: steps + 1], 0
     except (CertificateError, InfeasibleError) as error:
         n, entries = problem.system.dimension, problem.system.noise_dimension
@@ -153,6 +154,17 @@ def _grids(problem: Problem, effort: int, steps: int) -> tuple[list[Grid], int]:
     if n == 2 and math.prod(grid.shape) * pieces**entries * steps > _MOST_LOOKS:
         raise CertificateError("the checker would look at a grid as fine as this bound needs for more than a minute.")
     return [grid] * (steps + 1), pieces
+
+
+def _fitting(problem: Problem, share: float) -> list[Grid]:
+    """The grids of all steps with cells of this share of the noise, or larger ones where they would be too many."""
+    for _ in range(_COARSENED):
+        grids = step_grids(problem, share, _MOST_STEPS)
+        most = max(math.prod(grid.shape) for grid in grids)
+        if most <= _MOST_CELLS:
+            return grids
+        share *= 1.1 * (most / _MOST_CELLS) ** (1 / problem.system.dimension)
+    raise CertificateError(f"the checker looks at no grids of more than {_MOST_CELLS} cells.")
 
 
 def _parts(problem: Problem, most: int) -> int:
@@ -287,7 +299,15 @@ def _law_of(problem: Problem) -> Law:
         raise CertificateError("the checker knows value functions for normal and uniform noise only.")
     if system.noise.uniform and system.dimension > 1:
         raise CertificateError("the checker knows value functions for uniform noise in one state only.")
+    if not _independent(system):
+        raise CertificateError("the checker knows polynomials for noise only that is independent from state to state.")
     return system.noise
+
+
+def _independent(system: DiscreteSystem) -> bool:
+    """Whether each state has noise of its own."""
+    covariance = np.asarray(system.noise_matrix) @ system.noise.proxy @ np.asarray(system.noise_matrix).T
+    return not np.any(covariance - np.diag(np.diag(covariance)))
 
 
 def _splits(problem: Problem, axes: tuple[Array, ...]) -> list[Any]:

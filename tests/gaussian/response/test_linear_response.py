@@ -133,3 +133,33 @@ def test_all_steps_at_once_are_the_steps_one_by_one(columns, monkeypatch):
     some = found.boxes(np.concatenate([radii[:4], np.full((3, n), np.inf)]))  # nothing is known from step 4 on
     np.testing.assert_allclose(some[:5], found.boxes(radii)[:5], rtol=1e-14)
     assert np.all(some[5:] == np.inf)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("exponent", "noise"), [(50, 1e150), (0, 1e200)])
+def test_a_response_that_overflows_is_refused_in_words(exponent: int, noise: float) -> None:
+    """In its own units, or only where it is brought back to those of the states."""
+    unit = np.array([1.0, 2.0**exponent])
+    slope, shape = unit[:, None] * np.array([[0.0, 1.0], [-1.0, -0.4]]) / unit, (1, 10, 2, 2)
+    with pytest.raises(EngineError, match="beyond all floats before the horizon"):
+        continuous_response(
+            np.broadcast_to(slope, shape), np.zeros(shape), 0.1, noise * unit[:, None] * np.eye(2), np.zeros((2, 2))
+        )
+    with pytest.raises(EngineError, match="beyond all floats before the horizon"):
+        discrete_response(np.full((1, 40, 1, 1), 1e10), np.eye(1), 0.0, np.zeros((1, 1)))
+
+
+@pytest.mark.filterwarnings("error")
+def test_variances_beyond_all_floats_are_infinite_from_both_sides_or_no_bound() -> None:
+    response = discrete_response(np.full((1, 3, 1, 1), 0.5), np.array([[1e300]]), 0.0, np.array([[0.0]]))
+    low, high = response.variance(np.full((1, 4, 1), 1e10), np.arange(4))
+    assert np.all(high[0, 1:] == np.inf)
+    assert not np.isnan(low).any()
+
+
+@pytest.mark.filterwarnings("error")
+def test_slopes_that_are_no_numbers_for_the_series_are_too_stiff() -> None:
+    shape = (1, 1, 2, 2)
+    slope = np.broadcast_to([[1e200, 1e200], [-1e200, 1e200]], shape)
+    with pytest.raises(EngineError, match="too stiff"):
+        continuous_response(slope, np.zeros(shape), 1.0, np.eye(2), np.zeros((2, 2)))

@@ -102,3 +102,18 @@ def test_a_window_between_two_times_that_are_looked_at_is_seen_from_the_nearest_
     simulated = cb.simulate_exits(problem, paths=50_000, halve=False)
     assert found.lower <= simulated.upper
     assert simulated.lower <= found.upper < 2 * simulated.upper
+
+
+@pytest.mark.filterwarnings("error")
+def test_errors_of_rounding_that_outgrow_all_floats_are_refused_in_words() -> None:
+    """States in units 1e9 apart: one bound for all entries of the response then bounds none of them."""
+    big, small = 9.61e6, 0.0118
+    turning = cb.ContinuousSystem(
+        lambda x: [x[1] / small * 0.776 * big, (-0.776 * (x[0] / big) - 0.476 * (x[1] / small)) * small],
+        states=2, diffusion=[[0, 0], [0, 0.0007]],
+    )  # fmt: skip
+    start = cb.GaussianStart([big / 2, 0], [[2.3e11, 106.0], [106.0, 4e-7]])
+    safe = [cb.Inside(cb.HalfSpace([2.8e-10, 1], 0.0052))]
+    problem = cb.Problem(turning, initial=start, safe=safe, horizon=1.71, delta=1e-3)
+    with pytest.raises(ArithmeticError, match="floats bear"):
+        NoisyStart(problem)

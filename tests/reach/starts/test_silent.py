@@ -122,3 +122,19 @@ def test_what_does_not_fit_is_refused_in_words(change: dict[str, Any], word: str
     problem = cb.Problem(model(-np.eye(2)), initial=start, safe=safe, horizon=1).replace(**change)
     with pytest.raises(EngineError, match=word):
         bounded(problem)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rate", [1.0, 300.0])
+def test_paths_that_overflow_are_refused_in_words(rate: float) -> None:
+    """The mean stays at 0, and paths from all other starts run away, slowly or beyond all floats."""
+    problem = cb.Problem(
+        model([[rate]]), initial=cb.GaussianStart([0.0], [[1e-4]]), safe=[cb.Inside(cb.Box([-1], [1]))], horizon=2.0
+    )
+    if rate == 1.0:
+        found = bounded(problem)
+        truth = 2 * norm.sf(100 * np.exp(-2.0))
+        assert found.lower <= truth <= found.upper
+        return
+    with pytest.raises((ArithmeticError, EngineError), match="beyond"):
+        bounded(problem.replace(horizon=4.0))
