@@ -40,6 +40,11 @@ _HALVINGS = 48
 _SPLITS = (10.0, 3.0)  # how far the log probability granted to M lies below that of Z
 
 
+def _along(rows: Array, matrices: Array) -> Array:
+    """Rows (W, N, n) times a matrix each piece (N, n, m): (W, N, m)."""
+    return np.swapaxes(np.swapaxes(rows, 0, 1) @ matrices, 0, 1)
+
+
 @lru_cache(maxsize=1024)  # events share their probabilities
 def quantile(log_probability: float) -> float:
     """A level q with log Q(q) <= ``log_probability``, nearly the least."""
@@ -79,7 +84,7 @@ class Martingales:
         late, early = rows[:, 1:], rows[:, :-1]
         ends = [self._squares(late, np.zeros_like(loss)), self._squares(early, loss)]
         main = f.step / 2 * (np.where(f.inside, ends[0] + ends[1], 0.0)).sum(axis=1)
-        bulge = np.einsum("wki,kij,kjm->wkm", np.abs(late), f.bulge, self.size)
+        bulge = _along(np.abs(late), f.bulge @ self.size)
         rest = f.step * np.where(f.inside, (bulge**2).sum(axis=-1), 0.0).sum(axis=1)
         return (np.sqrt(main) + np.sqrt(rest)) * _ROUND, np.where(f.inside[:, :, None], loss, 0.0)
 
@@ -87,8 +92,8 @@ class Martingales:
         """Upper bounds of |rho (g - ghat)|^2 for rows (W, N, n) known up to ``blur``."""
         n = rows.shape[2]
         spread = self.radius + 2 * (n + 2) * _UNIT * self.size
-        size = np.abs(np.einsum("wki,kim->wkm", rows, self.middle))
-        size += np.einsum("wki,kim->wkm", np.abs(rows), spread) + np.einsum("wki,kim->wkm", blur, self.size)
+        size = np.abs(_along(rows, self.middle))
+        size += _along(np.abs(rows), spread) + _along(blur, self.size)
         return np.asarray((size**2).sum(axis=-1))
 
     @cached_property

@@ -156,13 +156,14 @@ def linear_reach(problem: Problem, *, noise: bool = True, cells: int | None = No
     answer = LinearAnswer(run=run, outcome=outcome, shown=outcome)
     if outcome.bounds is None:
         raise ArithmeticError(answer.reason)
-    tube = answer.tube if noise else None
-    for name, half in zip(problem.system.states, () if tube is None else tube.half_widths.T):
-        if not np.all(np.isfinite(half)):
+    reach = answer.reach if noise else answer.noise_free_reach
+    assert reach is not None
+    assert reach.box is not None
+    wide = np.maximum(np.abs(reach.box.lo), np.abs(reach.box.hi))
+    for i, name in enumerate(problem.system.states if noise else ()):
+        if not np.all(np.isfinite(wide[..., i])):
             raise ArithmeticError(
                 f"no bound of the deviation of {name} was found at delta = {problem.delta:.3g}; "
                 "shorten the horizon, or use method='contraction'."
             )
-    reach = answer.reach if noise else answer.noise_free_reach
-    assert reach is not None
     return reach

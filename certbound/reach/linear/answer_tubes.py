@@ -170,11 +170,15 @@ def deviation_tube(run: LinearRun, outcome: Outcome, bounds: tuple[Array, Array]
         half = np.maximum(half, (level + _apart(_coordinates(engine, cell), cell, bounds, silent)) * (1 + 1e-15))
     count = len(half)
     times = engine.times if engine.continuous else np.arange(count + 1.0)
-    log10 = min(max(log_probability / np.log(10.0), LEAST) * (1 - 1e-15), 0.0)
     own = engine.lasting
     if not isinstance(own, slice):
         times, half = np.append(times[own], times[-1]), half[own, : engine.states]
-    return DeviationTube(times=times, half_widths=half, log10_delta=float(log10))
+    return DeviationTube(times=times, half_widths=half, log10_delta=log10_up(log_probability))
+
+
+def log10_up(log_probability: float) -> float:
+    """log10 of a probability from its natural logarithm, rounded up."""
+    return float(min(max(log_probability / np.log(10.0), LEAST) * (1 - 1e-15), 0.0))
 
 
 def reach_tube(

@@ -30,6 +30,7 @@ from certbound.gaussian.response import (
 from certbound.problem.model import Tape
 from certbound.problem.problem import Problem
 from certbound.problem.systems import ContinuousSystem
+from certbound.reach.linear.answer_tubes import levels_of_coordinates
 from certbound.reach.linear.linearisation import Linearisation
 from certbound.reach.linear.run import LinearRun, Outcome
 from certbound.reach.linear.shares import Share
@@ -165,8 +166,33 @@ class DiffusionRun(LinearRun):
     # ---- the fixed point ---------------------------------------------------------------------------------
 
     def bounded(self, nonlinear: Share, effort: int = 2) -> Outcome:
-        """`probability`, which says by which reference."""
-        return self.probability(nonlinear, effort)
+        """See `LinearRun.bounded`; by the reference whose levels are smaller, in the mean of their logarithms."""
+        if nonlinear in self.outcomes:
+            return self.outcomes[nonlinear]
+        best = Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=None)
+        size = np.inf
+        for reference in self.references:
+            found = self._close(reference, nonlinear, effort)
+            if found is None:
+                continue
+            accepted, bounds, share = found
+            one = Outcome(log_probability=0.0, nonlinear=nonlinear, bounds=bounds)
+            self.accepted[nonlinear] = accepted
+            own = -np.inf if share < _ENOUGH else self._size(one)
+            if best.bounds is None or own < size:
+                best, kept, size = one, accepted, own
+            if share < _ENOUGH:
+                break
+        if best.bounds is not None:
+            self.accepted[nonlinear] = self.held = kept
+        return best
+
+    def _size(self, outcome: Outcome) -> float:
+        """How large levels are: along the inner rows, or along the coordinates where there are none."""
+        levels = [self.levels(outcome.nonlinear)[0]]
+        if not levels[0].size:
+            levels = levels_of_coordinates(self, outcome)[0]
+        return float(np.mean([np.log(np.maximum(part, 1e-300)).mean() for part in levels]))
 
     def probability(self, nonlinear: Share, effort: int = 2) -> Outcome:
         """Thm K7' with delta_N = exp(nonlinear.log), by the better of both references."""

@@ -184,11 +184,11 @@ class LinearAnswer:
     @cached_property
     def reach(self) -> ReachTube | None:
         """Sets that contain the state with probability at least 1 - delta (None when nothing was proved)."""
-        bounds, tube = self.shown.bounds, self.tube
-        if bounds is None or tube is None:
+        if self.shown.bounds is None:
             return None
-        levels, _ = answer_tubes.levels_of_coordinates(self.run, self.shown)
-        return answer_tubes.reach_tube(self.run, bounds, tube.log10_delta, levels)
+        levels, log_probability = answer_tubes.levels_of_coordinates(self.run, self.shown)
+        log10 = answer_tubes.log10_up(log_probability)
+        return answer_tubes.reach_tube(self.run, self.shown.bounds, log10, levels)
 
     @cached_property
     def noise_free_reach(self) -> ReachTube | None:

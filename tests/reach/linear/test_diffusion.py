@@ -162,3 +162,20 @@ def test_a_diffusion_of_time_alone_is_bounded_as_well() -> None:
     problem = growing().replace(system=system)
     found = cb.simulate_exits(problem, paths=40_000, rng=np.random.default_rng(4), steps=200, halve=False)
     assert found.lower <= 10 ** level(problem, Share.of(1e-3)) < 0.1
+
+
+def test_a_reach_tube_asks_for_no_limits_and_no_target() -> None:
+    """It was as good as its probability of leaving could be asked for, which a target forbids."""
+    plain, aimed = growing(), growing(reach=cb.Box([-1.0], [0.3]))
+    found, same = linear_reach(plain), linear_reach(aimed)
+    assert found.end == same.end == 2.0
+    np.testing.assert_array_equal(found.hull.hi, same.hull.hi)
+    assert found.log10_delta <= -2.0
+    rng, x, left = np.random.default_rng(3), np.full(2000, 0.5), np.zeros(2000, dtype=bool)
+    low, high = found.hull.lo[:, 0], found.hull.hi[:, 0]
+    times = np.linspace(0.0, 2.0, 401)
+    for t in times[1:]:
+        x = x - 0.005 * x + 0.1 * (1 + 0.3 * np.sin(x)) * np.sqrt(0.005) * rng.standard_normal(2000)
+        piece = min(int(t / 2.0 * len(low)), len(low) - 1)
+        left |= (x < low[piece]) | (x > high[piece])
+    assert left.mean() <= 0.015
