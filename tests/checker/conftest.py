@@ -276,7 +276,7 @@ def scattered() -> cb.Problem:
 
 @cache
 def backward_answer(
-    build: Callable[[], cb.Problem], *, lower: bool, cell: float = 0.15, steps: int = 12
+    build: Callable[[], cb.Problem], *, lower: bool, cell: float = 0.2, steps: int = 12
 ) -> tuple[cb.Problem, EngineAnswer]:
     """What the backward equation bounds on one coarse grid, for short checks."""
     problem = build()

@@ -20,8 +20,8 @@ _BASES |= {
     "gated below": _sharp(lambda: conftest.backward_certificate(conftest.loud_gated, lower=True, cell=0.2, steps=8)),
     "arrived": _sharp(lambda: conftest.backward_certificate(conftest.arriving, **_FINE)),
     "arrived below": _sharp(lambda: conftest.backward_certificate(conftest.arriving, lower=True, **_FINE)),
-    "pushed": _sharp(lambda: conftest.backward_certificate(conftest.pushed, steps=8)),
-    "pushed below": _sharp(lambda: conftest.backward_certificate(conftest.pushed, lower=True, cell=0.1, steps=14)),
+    "pushed": _sharp(lambda: conftest.backward_certificate(conftest.pushed, cell=0.5, steps=8)),
+    "pushed below": _sharp(lambda: conftest.backward_certificate(conftest.pushed, lower=True, cell=0.2, steps=14)),
     "scattered": _sharp(lambda: conftest.backward_certificate(conftest.scattered, **_FINE)),
     "scattered below": _sharp(lambda: conftest.backward_certificate(conftest.scattered, lower=True, **_FINE)),
 }
