@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,9 @@ import certbound as cb
 from certbound.values.kolmogorov import bound_failing
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.door import RATE, largest_at_start, refined, starts_in
+from certbound.values.kolmogorov.door import RATE, largest_at_start, refined, side_of, starts_in
 from certbound.values.kolmogorov.face_exits import face_of
+from tests.checker.conftest import pushed
 
 SHARES = {"half": 0.5, "nothing": 0.0}
 
@@ -238,3 +240,43 @@ def test_limits_whose_layer_no_cell_resolves_leave_a_lower_bound_little_error() 
         side.correct(side.residuals(side.begun))
     # .063, and .21 where exits count up to a fall by twelve powers of e a cell
     assert largest_at_start(side, starts_in(problem))[1] < 0.1
+
+
+def test_exits_count_from_below_once_cells_resolve_the_layer_at_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise leads paths over a third of a cell within the layer at the end: what counts exits there at once is paid
+    for by more than they are worth."""
+    still = cb.ContinuousSystem(lambda x, y: [0.0, 0.0], states=["x", "y"], diffusion=0.1 * np.eye(2))
+    problem = cb.Problem(still, initial=[0.3, 0.5], safe=[cb.Inside(cb.Box([0, 0], [1, 1]))], horizon=4.0)
+
+    def lower() -> float:
+        side = side_of(stages_of(problem), 0.2, 12, False)
+        side.propose()
+        return -refined(side, starts_in(problem))[0]
+
+    found = lower()
+    assert found > 0.08
+    monkeypatch.setattr("certbound.values.kolmogorov.carry._RESOLVED", 0.0)
+    assert lower() < 0.75 * found
+
+
+@pytest.mark.parametrize("build", [lambda: two_independent()[0], pushed], ids=["still", "changing"])
+def test_residuals_proved_while_the_error_is_solved_for_are_those_proved_after_it(
+    build: Callable[[], cb.Problem], monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    monkeypatch.setattr("certbound.values.kolmogorov.carry._BATCH", 20_000)  # several groups of slabs
+    first, second = (side_of(stages_of(build()), 0.2, 12, True) for _ in range(2))
+    for side in (first, second):
+        side.propose()
+        side.correct(side.residuals(True))
+    for _ in range(2):
+        on_the_way = first.corrected(first.residuals())
+        second.correct(second.residuals())
+        for own, other in zip(on_the_way, second.residuals(), strict=True):
+            np.testing.assert_array_equal(own, other)
+
+
+def test_an_error_that_overflows_leaves_no_residuals() -> None:
+    side = side_of(stages_of(two_independent()[0]), 0.2, 12, True)
+    side.propose()
+    assert side.corrected([np.full_like(one, 1e130) for one in side.residuals(True)]) == []
+    assert not side.finite

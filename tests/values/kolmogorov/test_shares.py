@@ -8,7 +8,7 @@ import pytest
 import certbound as cb
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.door import adapted, starts_in
+from certbound.values.kolmogorov.door import adapted, side_of, starts_in
 from certbound.values.kolmogorov.equation.solve import Equation, SplitEquation
 from certbound.values.kolmogorov.equation.sources import Breadth, at_knots, at_nodes
 from certbound.values.kolmogorov.error_shares import better_shapes, shares
@@ -130,3 +130,21 @@ def test_sources_are_continuous_in_time() -> None:
     slabs, steps = [np.array([1.0]), np.array([4.0]), np.array([2.0])], np.array([1.0, 1.0, 2.0])
     assert [float(one[0]) for one in at_knots(slabs, steps, Breadth.ABOVE)] == [1, 4, 4, 2]
     assert [float(one[0]) for one in at_knots(slabs, steps, Breadth.MEAN)] == [1, 2.5, (4 + 2 * 2) / 3, 2]
+
+
+def test_axes_that_are_improved_again_and_again_do_not_swing() -> None:
+    """Lorenz' model: along one axis layers, along another ones that coarse cells resolve less than all shares say."""
+    system = cb.ContinuousSystem(
+        lambda x, y, z: [4 * (y - x), x * (0.8 - z) - y, x * y - 1.5 * z], states=["x", "y", "z"],
+        diffusion=0.43 * np.eye(3),
+    )  # fmt: skip
+    safe = [cb.Inside(cb.Box([-1.3] * 3, [1.3] * 3))]
+    problem = cb.Problem(system, initial=[0.1, 0.1, 0.1], safe=safe, horizon=3.33)
+    side, counts = side_of(stages_of(problem), 0.2, 8, True), []
+    side.propose()
+    for _ in range(3):
+        side = side.on(better_shapes(side, side.residuals(True), np.array([[0.1, 0.1, 0.1]])))
+        side.propose()
+        counts.append([axis.cells for axis in side.axes])
+    changes = np.abs(np.diff(np.log(counts), axis=0))
+    assert changes.max() < np.log(1.25)  # by a factor of 1.3 up and down where the axes follow their shares at once
