@@ -14,30 +14,29 @@ from functools import cached_property, partial
 from itertools import chain, pairwise
 
 import numpy as np
-import scipy.sparse as sp
 
 from certbound.arrays import Array, Index, Mask
-from certbound.problem.sets import Inside
 from certbound.rigor.intervals import Interval
 from certbound.values.enclosing import enclose
-from certbound.values.kolmogorov.axes import Grazing, Plan, Size, plan_axes
+from certbound.values.kolmogorov.axes import Plan, Size, plan_axes
 from certbound.values.kolmogorov.box_setting import Setting
 from certbound.values.kolmogorov.equation import (
     ABOUT,
     BREADTHS,
-    SOLVED,
+    DEEP,
     Breadth,
     ChangingEquation,
-    Discretised,
-    Ghosts,
+    Mesh,
     at_knots,
     at_nodes,
-    discretised,
-    ghosts_of,
+    knots_of,
+    mesh_of,
+    ramp,
+    time_steps,
 )
 from certbound.values.kolmogorov.face_exits import ALWAYS, Face, face_of, shortfall
 from certbound.values.kolmogorov.factors import CLOCK, HALF, factor_of
-from certbound.values.kolmogorov.failed_cells import Shapes, depth_of, distance_to, most_kept, shortfall_on
+from certbound.values.kolmogorov.failed_cells import Shapes, distance_to, most_kept, shortfall_on
 from certbound.values.kolmogorov.residual import (
     Generator,
     most_at_knots,
@@ -55,9 +54,6 @@ from certbound.values.kolmogorov.splines import (
 )
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
-_FIRST = 12  # steps within that layer
-_GROWTH = {2: 1.15, 3: 1.3}  # of these steps: a front leaves it sharp, and blurs slowly; by the number of states
-_AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
 _OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
 _MARGIN = 0.1, 0.02  # by which a source exceeds what it pays for: in the first passes, and in those that pay all of it
 _LASTING = 0.5  # share of a slab's source that its neighbours have at least, in the latter: a source that ends at once
@@ -65,16 +61,9 @@ _LASTING = 0.5  # share of a slab's source that its neighbours have at least, in
 _RESOLVED = 8.0  # from below exits count from about this times the time in which noise crosses the cell at a limit
 _LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
-_DEEP = 3.0  # cells over which paths are killed, or arrive, at sets within the box
-_AROUND = 5  # cells beyond a box around a safe set of another shape: a solution that falls to 0 at the box's end rings
-_STIFF = 10.0  # how much faster than paths leave a cell nodes beyond an edge follow
-_SOFT = 3.0
-_KILL = 10.0
 _REACHED = 1.5
 _ON_FACE = 0.3  # of the source that would raise e to what v lacks while a path crosses one cell
 _BATCH = 300_000  # lattice points of the slabs that are looked at together
-_FOLDS = 1.0, 3.0  # powers of e by which a solution may fall within a cell at a limit, and may not: where it falls
-# by more, exits are not counted from below (v of Lorenz' model .31 with 6 and 12, .045 with these, failing -.028)
 _CALM = {2: 3, 3: 1}
 """Passes before the first one with a calm e, by the number of states, measured: with 1 and with 3 of them an epidemic's
 v is .20 and .38, Lorenz' lower side .101 and .103, Josephson's junction .0046 and .0045, a pendulum's lower bound
@@ -86,206 +75,10 @@ _MAKING_ROOM = 3  # turns until axes have about as many cells as asked
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
 
-def ramp(y: Array) -> Array:
-    """A C^2 step from 0 at 0 to 1 at 1."""
-    z = np.clip(y, 0, 1)
-    return np.asarray(z**3 * (10 - 15 * z + 6 * z * z))
-
-
 def rise(y: Array) -> Array:
     """A C^2 step from 0 at 0 to 1 at 1, odd about 0, where it is steepest."""
     z = np.clip(y, -1, 1)
     return np.asarray(z * (15 - 10 * z**2 + 3 * z**4) / 8)
-
-
-def time_steps(horizon: float, count: int, layer: float, growth: float) -> Array:
-    """Lengths of the steps from the end backward: small in the end layer, growing to horizon / count."""
-    return _graded(horizon, horizon / count, layer / _FIRST, growth)
-
-
-def _graded(length: float, largest: float, first: float, growth: float) -> Array:
-    step = first
-    result: list[float] = []
-    while step < largest and sum(result) + step < length:
-        result.append(step)
-        step *= growth
-    rest = length - sum(result)
-    more = max(int(np.ceil(rest / largest)), 1)
-    return np.array(result + [rest / more] * more)
-
-
-def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Array, growth: float) -> Array:
-    """Times of the knots, from the horizon back: as `time_steps`, with two about every break.
-
-    Before a break, backward in time, a solution that does not fit the new coefficients at faces has a layer in time.
-    """
-    half, largest = HALF * horizon, (horizon - begin) / count
-    ends = horizon - np.append(breaks[::-1], begin)  # passed, backward
-    passed = [0.0]
-    for k, end in enumerate(ends):
-        last = end - half if k < len(breaks) else end
-        first, faster = (layer / _FIRST, growth) if k == 0 else (layer * _AFTER, _QUICKER)
-        so_far = passed[-1]
-        passed += list(so_far + np.cumsum(_graded(last - so_far, largest, first, faster)))
-        passed[-1] = last
-        if k < len(breaks):
-            passed.append(end + half)
-    times = horizon - np.array(passed)
-    times[-1] = begin
-    return np.asarray(times)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Mesh:
-    """Nodes of a box, and beyond its limits by ``pad`` cells (lower and upper ends of each axis).
-
-    ``inside`` holds the points of the box nearest to the nodes; ``layer`` is the survival at the end that faces allow,
-    ``falls`` the share of it that limits take within the end layer, less where the flow is so strong against paths that
-    the grid does not resolve their layer: no exits need be counted there. ``arrival`` is the rate of arriving in the
-    target, ``leaving`` that of leaving the cells about a node. ``ghosts`` are nodes
-    beyond shapes.
-    """
-
-    nodes: tuple[Array, ...]
-    pad: tuple[tuple[int, int], ...]
-    inside: Array
-    equation: Discretised | ChangingEquation
-    layer: Array
-    falls: Array
-    rate: Array
-    arrival: Array | float
-    leaving: Array
-    ghosts: Ghosts | None
-
-
-def extended(nodes: Array, before: int, behind: int) -> Array:
-    """The nodes, and their mirror images beyond both ends."""
-    low = 2 * nodes[0] - nodes[before:0:-1] if before else nodes[:0]
-    high = 2 * nodes[-1] - nodes[-2 : -2 - behind : -1] if behind else nodes[:0]
-    return np.concatenate([low, nodes, high])
-
-
-def mesh_of(
-    setting: Setting,
-    nodes: list[Array],
-    grazing: list[Grazing],
-    row: int,
-    pad: tuple[int, int],
-    kill: bool,
-    span: float,
-    fresh: Mask,
-    early: bool = False,
-    solved: float = SOLVED,
-    failed: Mask | None = None,
-    shaped: bool = False,
-) -> Mesh:
-    """A grid with its equation; ``pad`` counts cells beyond noise-free limits that paths graze, and noisy ones.
-
-    ``fresh``, shape (2, n), says which ends are none of the stage after this; ``early`` whether paths arrive in some
-    cells before the target, or in its first cells. Systems are ``solved`` to about that. Paths are killed in cells that
-    have ``failed``; with ``shaped`` solutions have a given value on the edges of shapes.
-    """
-    n = setting.dimension
-    low, high = setting.low[row], setting.high[row]
-    free = {(one.axis, one.side) for one in grazing}
-    least = np.where(setting.around, _AROUND, 0)
-    own = [[max(pad[(i, side) not in free], int(least[side, i])) for side in (0, 1)] for i in range(n)]
-    pads = tuple((before, behind) for before, behind in own)
-    lines = tuple(extended(nodes[i], *pads[i]) for i in range(n))
-    points = np.array(np.meshgrid(*lines, indexing="ij"))
-    shape = points.shape[1:]
-    inside = np.clip(points, low.reshape(-1, *[1] * n), high.reshape(-1, *[1] * n))
-    flow, spread = setting.flow(inside), setting.spread(inside).reshape(n, n, *shape)
-    least, most, noise = _extremes(setting, inside, flow, spread) if setting.changing else (flow, flow, spread)
-    size, slowest = np.maximum(most, -least), np.clip(0, least, most)
-    dead, at_limit, layer, rate = np.zeros(shape, bool), np.zeros(shape), np.ones(shape), np.zeros(shape)
-    for i in range(n):
-        for side, place in ((0, 0), (1, shape[i] - 1)):
-            face = tuple(place if k == i else slice(None) for k in range(n))
-            out = most[i][face] if side else -least[i][face]
-            leaves = (noise[i, i][face] > 0) | (out >= 0)
-            gap = abs(lines[i][place] - lines[i][1 if side == 0 else -2])
-            resolved = 1 - _unresolved(-out, gap, noise[i, i][face]) if setting.noisy[i] else np.ones(leaves.shape)
-            dead[face] |= leaves
-            at_limit[face] = np.maximum(at_limit[face], leaves * float(setting.limited[side, i]) * resolved)
-            width = np.sqrt(max(noise[i, i][face].max(), 0.0) * span) or np.maximum(out, 0).mean() * span
-            if not fresh[side, i]:
-                continue
-            third = abs(lines[i][place] - lines[i][3 if side == 0 else -4])
-            layer = layer * ramp(np.abs(points[i] - lines[i][place]) / max(width, third))
-    for i in range(n):
-        for side in (0, 1):
-            if pads[i][side] and (i, side) not in free:
-                edge = (low, high)[side][i]
-                out = (2 * side - 1) * (points[i] - edge)
-                beyond = abs(lines[i][-1 if side else 0] - edge)
-                speed = size[i] / beyond + noise[i, i] / beyond**2
-                rate += _KILL * speed * ramp(out / beyond)
-    for one in grazing:
-        edge = (low, high)[one.side][one.axis]
-        out = (2 * one.side - 1) * (points[one.axis] - edge)
-        if pads[one.axis][one.side]:
-            beyond = abs(lines[one.axis][-1 if one.side else 0] - edge)
-            rate += _KILL * size[one.axis].max() / beyond * ramp(out / beyond)
-        if kill:
-            width = (0.3 * _SOFT**3 + 2) * one.scale
-            rate += 3 * _SOFT * one.speed / width * _bump(out / width) * _bump(slowest[one.axis] / (_SOFT * one.speed))
-    if failed is not None and failed.any():
-        within = ramp(depth_of(_padded(failed, pads, setting.around)) / _DEEP)
-        rate += _KILL * _leaving(lines, size, noise, _DEEP) * np.asarray(within)
-    ghosts, more = None, None
-    if shaped and setting.shapes:
-        ghosts = ghosts_of(lines, partial(_within, setting.shapes))
-        stiff = _STIFF * _leaving(lines, size, noise)
-        more = sp.diags_array(stiff.ravel()) @ ghosts.matrix
-        flow, spread = flow * ~ghosts.nodes, spread * ~ghosts.nodes
-        dead &= ~ghosts.nodes
-        rate = np.where(ghosts.nodes, stiff, rate)
-    arrival: Array | float = 0.0
-    layer[dead] = 0
-    falls = at_limit
-    if setting.target is not None:
-        depth = _depth(setting.target[:, row], lines, points)
-        there = ramp(1 + depth if early else depth)
-        arrival = _KILL * _leaving(lines, size, noise, _DEEP) * there
-        rate += arrival
-        layer += (1 - layer) * there
-        falls *= 1 - there
-    equation: Discretised | ChangingEquation = (
-        ChangingEquation(lines, dead, rate, setting.noisy, more) if setting.changing
-        else discretised(lines, flow, spread, dead, rate, solved, more)
-    )  # fmt: skip
-    return Mesh(
-        nodes=lines, pad=pads, inside=inside, equation=equation, layer=layer, falls=falls, rate=rate,
-        arrival=arrival, leaving=_leaving(lines, size, noise), ghosts=ghosts,
-    )  # fmt: skip
-
-
-def _unresolved(against: Array, gap: Array | float, noise: Array) -> Array:
-    """How little cells of width ``gap`` resolve the layer that flow against paths leaves at a limit, from 0 to 1.
-
-    Failing falls by e in it over noise / (2 flow).
-    """
-    folds = 2 * np.maximum(against, 0) * gap / (noise + 1e-300)
-    return ramp((folds - _FOLDS[0]) / (_FOLDS[1] - _FOLDS[0]))
-
-
-def _depth(target: Array, lines: tuple[Array, ...], points: Array) -> Array:
-    """How deep nodes lie in the target, in units of three cells at its faces, negative before it.
-
-    Where it reaches beyond the grid it has no face.
-    """
-    depth = np.full(points.shape[1:], np.inf)
-    for i, line in enumerate(lines):
-        for side in (0, 1):
-            end = target[side, i]
-            if line[0] < end < line[-1]:
-                place = int(np.clip(np.searchsorted(line, end), 3, len(line) - 4))
-                cells = (line[place + 3] - line[place - 3]) / 2
-                depth = np.minimum(depth, (1 - 2 * side) * (points[i] - end) / cells)
-            elif (end >= line[-1]) != bool(side):
-                depth = np.full_like(depth, -np.inf)
-    return depth
 
 
 def _across(marked: Mask, axis: int, dimension: int) -> tuple[slice | Mask, ...]:
@@ -304,36 +97,6 @@ def _common(axes: tuple[Axis, ...], others: tuple[Axis, ...]) -> tuple[tuple[sli
     return tuple(own), tuple(places)
 
 
-def _extremes(setting: Setting, points: Array, flow: Array, spread: Array) -> tuple[Array, Array, Array]:
-    """Least and largest f and largest a over moments and disturbances."""
-    least, most, noise = flow, flow, spread
-    for time in setting.moments():
-        for acting in setting.nodes:
-            one = setting.flow(points, time, acting)
-            least, most = np.minimum(least, one), np.maximum(most, one)
-        noise = np.maximum(noise, setting.spread(points, time).reshape(spread.shape))
-    return least, most, noise
-
-
-def _leaving(lines: tuple[Array, ...], size: Array, noise: Array, cells: float = 1.0) -> Array:
-    """Rates of leaving some cells about each node."""
-    rate = np.zeros(size.shape[1:])
-    for i, line in enumerate(lines):
-        width = cells * np.gradient(line).reshape([-1 if k == i else 1 for k in range(len(lines))])
-        rate += size[i] / width + noise[i, i] / width**2
-    return rate
-
-
-def _padded(failed: Mask, pads: Sequence[tuple[int, int]], around: Array) -> Mask:
-    """Cells that have failed, and all beyond the ends of a box around a safe set."""
-    result = np.pad(failed, pads, mode="edge")
-    for k, (before, behind) in enumerate(pads):
-        line = np.moveaxis(result, k, 0)
-        line[:before] |= around[0, k]
-        line[len(line) - behind :] |= around[1, k]
-    return result
-
-
 def _largest_around(cells: Array) -> Array:
     """The largest of each cell and its neighbours."""
     from scipy.ndimage import maximum_filter
@@ -341,16 +104,8 @@ def _largest_around(cells: Array) -> Array:
     return np.asarray(maximum_filter(cells, 3))
 
 
-def _within(shapes: Sequence[Inside], points: Array) -> Mask:
-    return np.asarray(np.logical_and.reduce([shape.satisfied(points) for shape in shapes]))
-
-
 def _wider(shape: Size, factor: float, places: Array) -> Array:
     return factor * shape(places)
-
-
-def _bump(y: Array) -> Array:
-    return np.asarray(np.exp(-y * y / 2))
 
 
 def _small(row: Array) -> bool:
@@ -430,15 +185,15 @@ class Side:
         self.axes = tuple(Axis(line, Sampling(parts)) for line in nodes)
         self.shapes = Shapes.of(setting.shapes, self.axes)
         self.mesh = mesh_of(
-            setting, nodes, grazing, row, (0, 0) if above else (_STRIP, 0), above, self.layer, fresh, not above,
-            shaped=True,
-        )
+            setting, nodes, grazing, row, pad=(0, 0) if above else (_STRIP, 0), kill=above, span=self.layer,
+            fresh=fresh, early=not above, shaped=True,
+        )  # fmt: skip
         self.carrier = mesh_of(
-            setting, nodes, grazing, row, (_STRIP, _PAD), False, self.layer, fresh, solved=ABOUT,
+            setting, nodes, grazing, row, pad=(_STRIP, _PAD), span=self.layer, fresh=fresh, solved=ABOUT,
             failed=self.shapes.failed,
-        )
+        )  # fmt: skip
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
-        self.steps = time_steps(span * longer, steps, self.layer, _GROWTH[setting.dimension])
+        self.steps = time_steps(span * longer, steps, self.layer, setting.dimension)
         self._follow_changes(int(np.ceil(setting.pace * steps)))
         self.maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.mesh.nodes)]
         self.carried_maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.carrier.nodes)]
@@ -535,7 +290,7 @@ class Side:
         self.clock: Array | None = None
         self.times = horizon - np.append(0.0, np.cumsum(self.steps))
         if setting.timed or setting.staged:  # a stage is as long as it is
-            self.times = knots_of(begin, horizon, steps, self.layer, setting.breaks, _GROWTH[setting.dimension])
+            self.times = knots_of(begin, horizon, steps, self.layer, setting.breaks, setting.dimension)
             self.steps = -np.diff(self.times)
             self.brief = self.steps < 4 * HALF * horizon
             self.clock = 2 * CLOCK * horizon / self.steps
@@ -752,7 +507,7 @@ class Side:
 
         arrival, ghosts = self.mesh.arrival, self.mesh.ghosts
         if ghosts is not None:
-            a = ghosts.fill(a * rise((distance_to(ghosts.nodes) - 0.5) / _DEEP))
+            a = ghosts.fill(a * rise((distance_to(ghosts.nodes) - 0.5) / DEEP))
         self._now(self.mesh, 0, a)
         kept(a)
         for k, step in enumerate(self.steps):

@@ -11,8 +11,9 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.values.kolmogorov import bound_failing
 from certbound.values.kolmogorov.box_setting import Setting, stages_of
-from certbound.values.kolmogorov.carry import Side, knots_of
+from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import refined, starts_in
+from certbound.values.kolmogorov.equation import knots_of
 from certbound.values.kolmogorov.factors import HALF, clock_breaks, disturbance_nodes, factor_of
 from certbound.values.kolmogorov.products import separated
 
@@ -127,7 +128,7 @@ def test_the_clock_s_jumps_and_bends_are_found_and_each_stands_in_a_slab_of_its_
     ).dynamics  # fmt: skip
     breaks = clock_breaks([tape], 2.0)
     assert np.allclose(breaks, [0.3, 0.9, np.pi / 2, 1.8], atol=1e-12)
-    times = knots_of(0.0, 2.0, 20, 0.1, breaks, 1.15)
+    times = knots_of(0.0, 2.0, 20, 0.1, breaks, 2)
     assert times[0] == 2.0
     assert times[-1] == 0.0
     assert np.all(np.diff(times) < 0)

@@ -1,13 +1,14 @@
-"""The backward equation and its sources in floats: nothing here is trusted."""
+"""The backward equation, its grids and its sources in floats: nothing here is trusted."""
 
 from __future__ import annotations
 
 from certbound.values.kolmogorov.equation.changing import ChangingEquation
-from certbound.values.kolmogorov.equation.ghost_nodes import Ghosts, ghosts_of
-from certbound.values.kolmogorov.equation.solve import ABOUT, SOLVED, Discretised, discretised
+from certbound.values.kolmogorov.equation.knots import knots_of, time_steps
+from certbound.values.kolmogorov.equation.mesh import DEEP, Mesh, mesh_of, ramp
+from certbound.values.kolmogorov.equation.solve import ABOUT
 from certbound.values.kolmogorov.equation.sources import BREADTHS, Breadth, at_knots, at_nodes
 
 __all__ = [
-    "ABOUT", "BREADTHS", "SOLVED", "Breadth", "ChangingEquation", "Discretised", "Ghosts", "at_knots", "at_nodes",
-    "discretised", "ghosts_of",
+    "ABOUT", "BREADTHS", "DEEP", "Breadth", "ChangingEquation", "Mesh", "at_knots", "at_nodes", "knots_of", "mesh_of",
+    "ramp", "time_steps",
 ]  # fmt: skip
