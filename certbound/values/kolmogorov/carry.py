@@ -55,8 +55,12 @@ from certbound.values.kolmogorov.splines import (
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
-_MARGIN = 0.1, 0.02  # by which a source exceeds what it pays for: in the first passes, and in those that pay all of it
-_LASTING = 0.5  # share of a slab's source that its neighbours have at least, in the latter: a source that ends at once
+_MARGIN = 0.1, 0.02, 1.0
+"""By which a source exceeds what it pays for: in the first passes, in two that pay all of it, and in later ones. To
+these single cells are left, on which e pays two thirds of what it is to: a swing's lower bound took 12 passes with .02
+and 7 with 1; more than 1 costs more than that."""
+
+_LASTING = 0.5  # share of a slab's source that its neighbours have at least, where it pays: a source that ends at once
 # leaves e a kink in time, and what that leaves moves through the slabs pass by pass
 _RESOLVED = 8.0  # from below exits count from about this times the time in which noise crosses the cell at a limit
 _LARGEST = 1e100  # a coefficient
@@ -590,15 +594,16 @@ class Side:
         """Correct v from the end backward: the knots after which it is final, while they are finite."""
         equation, breadth = self.carrier.equation, BREADTHS[min(self.passes, len(BREADTHS) - 1)]
         paying = breadth is Breadth.ABOVE
+        margin = _MARGIN[paying + (self.passes > len(BREADTHS))]
         spread = partial(at_nodes, pads=self.carrier.pad, breadth=breadth)
         residuals = [np.zeros_like(r) if brief else r for r, brief in zip(residuals, self.brief)]
         if paying:
             residuals = _lasting(residuals)
         slabs = [spread(r) + b for r, b in zip(residuals, self._at_exits(spread, breadth))]
-        ends = [(1 + _MARGIN[paying]) * s * equation.live for s in at_knots(slabs, self.steps, breadth)]
+        ends = [(1 + margin) * s * equation.live for s in at_knots(slabs, self.steps, breadth)]
         late = self.shortfall_at_end()
         late[self.shapes.cut] = np.maximum(late[self.shapes.cut], self.shortfall_on_edges()[0])
-        errors = self._errors(ends, (1 + _MARGIN[paying]) * spread(late) * equation.live)
+        errors = self._errors(ends, (1 + margin) * spread(late) * equation.live)
         if self.passes >= _CALM[self.setting.dimension]:
             errors = self._calmed(errors)
         self.passes += 1

@@ -227,7 +227,8 @@ def test_passes_contract_at_corners_that_paths_leave_within_a_small_part_of_a_st
         residuals = side.residuals(side.begun)
         left.append(float(sum(h * r.max() for h, r in zip(side.steps, residuals))))
         side.correct(residuals)
-    assert left[8] < 0.003 * left[0]  # .0014
+    # 2.3e-5; .0011 with a margin of .02 in the end, 3e-4 where sources end at once
+    assert left[8] < 1e-4 * left[0]
 
 
 def test_limits_whose_layer_no_cell_resolves_leave_a_lower_bound_little_error() -> None:
