@@ -13,6 +13,7 @@ from certbound.quadratic.corners import curved_axes
 from certbound.quadratic.setting import Setting, diffusion_of, never_crossed, safe_sides
 from certbound.rigor.intervals import Interval
 
+_AWAY = 1e100  # states beyond it: their squares may overflow
 _PATHS, _STEPS, _SEED = 160, 300, 20
 _MARGINS = (4.0, 7.0, 2.5)
 _ROOMY = 1.05  # a ball's sides are moved out by this, so that they are no walls
@@ -111,7 +112,7 @@ def _sampled(problem: Problem, low: Array, high: Array) -> tuple[Array, Array, A
         shock = (gain @ rng.standard_normal((_PATHS, diffusion.shape[1], 1)))[..., 0]
         x = x + step * drift(t, *x.T, *d.T) + np.sqrt(step) * shock
         x = np.clip(x, low, high)
-        if not np.all(np.isfinite(x)):
+        if not np.all(np.abs(x) < _AWAY):
             raise InfeasibleError("sampled paths run away; quadratic value bounds need them bounded.")
         bottom, top = np.minimum(bottom, x.min(axis=0)), np.maximum(top, x.max(axis=0))
         spread = np.maximum(spread, x.std(axis=0))

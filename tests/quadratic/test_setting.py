@@ -120,3 +120,12 @@ def test_who_asks_for_it_alone_gives_it_all_of_his_time(
         quadratic_engine(of([cb.Inside(cb.Box([-1] * 3, [1] * 3))], system=cooling, initial=[0] * 3),
                          Request(thorough=thorough))  # fmt: skip
     assert granted[0] == pytest.approx(most, abs=0.5)
+
+
+@pytest.mark.filterwarnings("error")
+def test_sampled_paths_whose_squares_overflow_run_away() -> None:
+    """Steps of 1/300 of the horizon: a swing of 48 rad a second grows by four a step."""
+    fast = cb.ContinuousSystem(lambda x: [x[1], -2300 * x[0]], states=["p", "v"], diffusion=[[0.0], [0.3]])
+    slanted = cb.Inside(cb.HalfSpace([1.0, 0.01], 5.0))
+    with pytest.raises(InfeasibleError, match="run away"):
+        bound_quadratic(of([slanted], system=fast, horizon=24.8))

@@ -34,6 +34,7 @@ _MOST_WINDOWS = 4000
 _EACH = 8, 24  # steps before a window with an H of their own
 _SAME = 0.02  # of log10: what a bound may lose when it is turned to the opposite side
 _GROWTH = 1.4  # of the pieces before these
+_AWAY = 1e100  # states beyond it: their squares may overflow
 _PATHS, _SEED = 200, 21
 _BOXES = (7.0, True), (5.0, False), (4.0, False)
 """Standard deviations beyond sampled paths of the box's sides, and whether the safe set's sides stay as they are."""
@@ -264,7 +265,7 @@ def _sampled(problem: Problem, low: Array, high: Array) -> tuple[Array, Array, A
     for t in range(min(int(problem.horizon), 1000)):
         x = step(float(t), *x.T, *d.T) + rng.standard_normal((_PATHS, root.shape[1])) @ root.T
         x = np.clip(x, low, high)
-        if not np.all(np.isfinite(x)):
+        if not np.all(np.abs(x) < _AWAY):
             raise InfeasibleError("sampled paths run away; quadratic value bounds need them bounded.")
         bottom, top = np.minimum(bottom, x.min(axis=0)), np.maximum(top, x.max(axis=0))
         spread = np.maximum(spread, x.std(axis=0))
