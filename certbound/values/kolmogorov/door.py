@@ -168,6 +168,8 @@ class Search:
                 if self.runs == 1 and self.work - begun + _WHOLE * side.work > budget:  # an upper bound at least
                     yield self._bounds(side, proved=self.work > 0)
                     return
+                if above and self._far_above(side):
+                    continue
                 side = silent = self._solved(side)
                 if above and len(self.sides) > 1 and self.estimate > _FAR * self.delta > 0:
                     continue
@@ -180,6 +182,16 @@ class Search:
                     return
                 if self.delta > 0 and (_FAR * self.estimate < self.delta or self.cost > _CHEAP * budget):
                     break
+
+    def _far_above(self, side: Side) -> bool:
+        """Whether the first solution, on axes that nothing improved yet, leaves no doubt that a lower bound decides."""
+        if self.runs > 1 or len(self.sides) == 1 or not self.delta > 0:
+            return False
+        for stage in side.stages[::-1]:
+            stage.propose()
+        self.work += _ROUGH / 2 * side.work
+        self.estimate = abs(largest_at_start(side, self.starts)[0])
+        return self.estimate > _FAR**2 * self.delta
 
     def _side(self, above: bool) -> Side:
         count = math.ceil(_STEPS / self.cell)
