@@ -119,9 +119,10 @@ def _small(row: Array) -> bool:
 def _lasting(slabs: Sequence[Array]) -> list[Array]:
     """What is asked for in each slab, and a share of what is in those before and after it."""
     result = list(slabs)
-    for order in (range(1, len(result)), range(len(result) - 2, -1, -1)):
-        for k in order:
-            result[k] = np.maximum(result[k], _LASTING * result[k - 1 if order.step > 0 else k + 1])
+    for _ in ("later", "earlier"):
+        for k in range(1, len(result)):
+            result[k] = np.maximum(result[k], _LASTING * result[k - 1])
+        result.reverse()
     return result
 
 
@@ -492,9 +493,10 @@ class Side:
         """Solve for the survival A; v is 1 - A from above, A - 1 from below."""
         equation, above, limit = self.mesh.equation, self.above, self.mesh.falls
         span = self.layer if above else self._until_resolved()
+        longest = np.max(span)
 
         def fall(tau: float) -> Array | float:
-            if above or tau >= np.max(span):
+            if above or tau >= longest:
                 return 0.0
             passed = np.minimum(tau / span, 1.0)
             return np.asarray(-30 * (passed * (1 - passed)) ** 2 / span * limit * first)

@@ -187,9 +187,7 @@ class Search:
         """Whether the first solution, on axes that nothing improved yet, leaves no doubt that a lower bound decides."""
         if self.runs > 1 or len(self.sides) == 1 or not self.delta > 0:
             return False
-        for stage in side.stages[::-1]:
-            stage.propose()
-        self.work += _ROUGH / 2 * side.work
+        _propose(side)
         self.estimate = abs(largest_at_start(side, self.starts)[0])
         return self.estimate > _FAR**2 * self.delta
 
@@ -213,8 +211,8 @@ class Search:
     def _solved(self, side: Side) -> Side:
         """Solve on one grid, or on better ones with as many cells; the side on these, once corrected."""
         above = side.above
-        for stage in side.stages[::-1]:
-            stage.propose()
+        if not side.values:
+            _propose(side)
         rounds = 0 if above in self.shapes or side.later is not None else 1 if self.shapes else _ROUNDS
         side, residuals = adapted(side, self.starts, rounds)
         value = largest_at_start(side, self.starts)[0]
@@ -276,6 +274,11 @@ class Search:
             lower=self.lower, upper=self.upper, cells=cells_of(side.axes), steps=math.ceil(_STEPS / self.cell),
             runs=self.runs if proved else 0, estimate=self.estimate, work=self.work, witnesses=self.kept, search=self,
         )  # fmt: skip
+
+
+def _propose(side: Side) -> None:
+    for stage in side.stages[::-1]:
+        stage.propose()
 
 
 Shapes = tuple[float, list[Shape]]

@@ -15,7 +15,7 @@ import certbound as cb
 from certbound.values.kolmogorov import bound_failing
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.door import RATE, largest_at_start, refined, side_of, starts_in
+from certbound.values.kolmogorov.door import RATE, Search, largest_at_start, refined, side_of, starts_in
 from certbound.values.kolmogorov.face_exits import face_of
 from tests.checker.conftest import pushed
 
@@ -281,3 +281,16 @@ def test_an_error_that_overflows_leaves_no_residuals() -> None:
     side.propose()
     assert side.corrected([np.full_like(one, 1e130) for one in side.residuals(True)]) == []
     assert not side.finite
+
+
+def test_a_first_solution_far_above_the_target_leaves_the_upper_side_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = two_independent()
+    sides: list[bool] = []
+    solved = Search._solved
+    monkeypatch.setattr(Search, "_solved", lambda self, side: (sides.append(side.above), solved(self, side))[1])
+    found = last(problem, seconds=2.0, delta=truth / 10)
+    assert found.lower > truth / 10
+    assert True not in sides
+    sides.clear()
+    last(problem, seconds=2.0, delta=truth / 1.5)
+    assert sides[0]
