@@ -363,3 +363,11 @@ def never_crossed(problem: Problem, box: Interval, axis: int, place: float) -> b
     noise = enclose(diffusion, there, undefined="infinite")[axis]
     rise = enclose(jacobian(diffusion), whole, undefined="infinite")[axis * columns : (axis + 1) * columns]
     return bool(np.all((noise.lo == 0) & (noise.hi == 0)) and np.all(np.isfinite(rise.mag)))
+
+
+def deviation_of(paths: Array) -> Array:
+    """Standard deviation of each state of sampled paths (P, n); InfeasibleError where it overflows."""
+    found = paths.std(axis=0)
+    if not np.all(np.isfinite(found)):
+        raise InfeasibleError("sampled paths run away; quadratic value bounds need them bounded.")
+    return np.asarray(found)
