@@ -28,7 +28,7 @@ from certbound.values.sets import as_stays
 _PATHS, _STEPS, _EVERY = 2000, 400, 10
 _RARE = 2e-4  # share of the visits that lies beyond the range on either side
 _NARROWEST = 0.1  # of the room between limits: the narrowest range
-_AT_REST = 1e-3  # of its size, or of 1: the same where there is a limit on one side at most
+_AT_REST = 1e-3  # of its size, of 1 at 0: the same where there is a limit on one side at most
 _MARGIN = 0.4  # of the range, beyond it, where no limit stands
 _DEVIATIONS = 3.5  # of a normal start, which belong to the range
 _MOMENTS = 7  # times at which an axis looks at a model that changes
@@ -397,7 +397,8 @@ def _visited(
         if k == 0:
             least, most = np.minimum(least, low.min(axis=0)), np.maximum(most, high.max(axis=0))
         room = inner_high[k] - inner_low[k]
-        narrow = np.where(np.isfinite(room), _NARROWEST * room, _AT_REST * np.maximum(1.0, np.abs(least)))
+        size = np.maximum(np.abs(least), np.abs(most))
+        narrow = np.where(np.isfinite(room), _NARROWEST * room, _AT_REST * np.where(size > 0, size, 1.0))
         more = np.maximum(narrow - (most - least), 0.0) / 2
         result.append((least - more, most + more))
     return np.array(result)

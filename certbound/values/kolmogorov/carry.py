@@ -52,6 +52,7 @@ from certbound.values.kolmogorov.splines import (
     most_on_cells,
     sliding_max,
 )
+from certbound.watch import OutOfTime, poll
 
 END = 0.3  # times a cell's share of the range: the layer at the end, as a share of the horizon
 _OFTEN = 1.2, 0.9  # cost of a cell of a model that changes, and what each extreme disturbance adds, measured
@@ -517,6 +518,7 @@ class Side:
         self._now(self.mesh, 0, a)
         kept(a)
         for k, step in enumerate(self.steps):
+            poll("solving the backward equation")
             if not self.brief[k]:
                 a = equation.step(a, step, partial(_same, arrival), partial(_later, fall, tau, step))
                 a = a if ghosts is None else ghosts.fill(a)
@@ -543,14 +545,22 @@ class Side:
             _ = (self.sketch.images, rough or self.generator.images)
         begun, knots, slabs = 0, list[Future[Array]](), list[Future[list[Array]]]()
         with ThreadPoolExecutor(2) as pool:
-            for k in final or [count]:
-                while begun < count and k >= min(begun + many, count):
-                    end = min(begun + many, count)
-                    if same and not rough:
-                        knots.append(pool.submit(self._at_knots, slice(begun + (begun > 0), end + 1)))
-                    slabs.append(pool.submit(self._bounded, rough, slice(begun, end), knots[-2:]))
-                    begun = end
-            return [bound for part in slabs for bound in part.result()] if begun == count else []
+            try:
+                for k in final or [count]:
+                    while begun < count and k >= min(begun + many, count):
+                        end = min(begun + many, count)
+                        if same and not rough:
+                            knots.append(pool.submit(self._at_knots, slice(begun + (begun > 0), end + 1)))
+                        slabs.append(pool.submit(self._bounded, rough, slice(begun, end), knots[-2:]))
+                        begun = end
+                bounds: list[Array] = []
+                for part in slabs:
+                    bounds += part.result()
+                    poll("bounding what a solution leaves")
+            except OutOfTime:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return bounds if begun == count else []
 
     def _at_knots(self, some: slice[int, int, int]) -> Array:
         return most_at_knots(self.generator, np.array(self.values[some]), np.array(self.rates[some]))
@@ -624,6 +634,7 @@ class Side:
         e = equation.solve(self.steps[0], missing + self.steps[0] * ends[0])
         yield e, equation.speed(e, ends[0])
         for k, step in enumerate(self.steps):
+            poll("solving for the error that is left")
             if not self.brief[k]:
                 e = equation.step(e, step, partial(_between, ends[k], ends[k + 1]), _nothing)
             self._now(self.carrier, k + 1)

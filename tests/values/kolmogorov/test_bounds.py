@@ -16,6 +16,7 @@ from certbound.values.kolmogorov import bound_failing
 from certbound.values.kolmogorov.box_setting import stages_of
 from certbound.values.kolmogorov.carry import Side
 from certbound.values.kolmogorov.door import RATE, Search, largest_at_start, refined, side_of, starts_in
+from certbound.values.kolmogorov.equation.mesh import extended
 from certbound.values.kolmogorov.face_exits import face_of
 from tests.checker.conftest import pushed
 
@@ -294,3 +295,18 @@ def test_a_first_solution_far_above_the_target_leaves_the_upper_side_alone(monke
     sides.clear()
     last(problem, seconds=2.0, delta=truth / 1.5)
     assert sides[0]
+
+
+def test_axes_go_on_beyond_their_ends_by_more_nodes_than_they_have():
+    nodes = np.array([0.0, 1.0, 3.0])
+    assert extended(nodes, 4, 1).tolist() == [-6.0, -5.0, -3.0, -1.0, 0.0, 1.0, 3.0, 5.0]
+
+
+def test_ranges_do_not_depend_on_units():
+    ranges = []
+    for unit in (1.0, 1e-7):  # one state, and the way of the other one, that nothing limits above
+        system = cb.ContinuousSystem(lambda x, y: [y, -x - y], states=["x", "y"], diffusion=[[0.0], [0.1 * unit]])
+        safe = cb.Inside(cb.Box([-unit, -np.inf], [np.inf, np.inf]))
+        problem = cb.Problem(system, initial=[0.5 * unit, 0.0], safe=[safe], horizon=1.0)
+        ranges.append(stages_of(problem)[0].range / unit)
+    assert ranges[1] == pytest.approx(ranges[0], rel=1e-9)

@@ -65,9 +65,7 @@ class Mesh:
 
 def extended(nodes: Array, before: int, behind: int) -> Array:
     """The nodes, and their mirror images beyond both ends."""
-    low = 2 * nodes[0] - nodes[before:0:-1] if before else nodes[:0]
-    high = 2 * nodes[-1] - nodes[-2 : -2 - behind : -1] if behind else nodes[:0]
-    return np.concatenate([low, nodes, high])
+    return np.pad(nodes, (before, behind), mode="reflect", reflect_type="odd")
 
 
 def mesh_of(
