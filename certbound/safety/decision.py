@@ -262,8 +262,9 @@ class _Search:
             turn.append(True)
             with self.watch.share(_LAST if surely else share):
                 self._in_turn(names[1:])
-            with self.watch.share(share):
-                self.go_on(names[1:], patient=False)
+            if not surely:
+                with self.watch.share(share):
+                    self.go_on(names[1:], patient=False)
             if self.safe:
                 raise OutOfTime
 

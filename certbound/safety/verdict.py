@@ -247,7 +247,7 @@ def stopped(name: str, phase: str) -> EngineAnswer:
 def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: str = "auto") -> Verdict:
     """The best answer: certified before not, then the smaller probability, then the larger margin.
 
-    Without any answer, UNKNOWN by ``method``.
+    Where a lower bound decides, method and reason are those of its engine. Without any answer, UNKNOWN by ``method``.
     """
     if not answers:
         answers = {method: EngineAnswer(applicable=False, method=method, reason="no engine came to an answer.")}
@@ -282,14 +282,18 @@ def verdict_of(problem: Problem, answers: Mapping[str, EngineAnswer], method: st
             f"two engines contradict each other: {name} proves at most 10^{level:.6g}, another one at least "
             f"10^{lower:.6g}; this is a defect of certbound, and nothing is answered."
         )
-    asked = {other: answer for other, answer in answers.items() if other != name and answer.reason != SPARED}
+    shown = name  # who decides
+    if unsafe and not safe:
+        shown = next(one for one, answer in answers.items() if answer.applicable and answer.log10_lower == lower)
+        reason = reason if shown == name else answers[shown].below or answers[shown].reason
+    asked = {other: answer for other, answer in answers.items() if other != shown and answer.reason != SPARED}
     others = [f"By {one}: {_bounded(answer)}{_sentence(answer.reason)}" for one, answer in asked.items() if not safe]
     return Verdict(
         status="SAFE" if safe else "UNSAFE" if unsafe else "UNKNOWN",
         log10_delta=level,
         log10_lower=lower,
         reason=" ".join([_sentence(reason), *others]).strip(),
-        method=best.method or name,
+        method=answers[shown].method or shown,
         **{part: getattr(best, part) for part in _TAKEN},
         problem=problem,
         answers=MappingProxyType(dict(answers)),

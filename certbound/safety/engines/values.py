@@ -33,8 +33,8 @@ _GRANT = 0.7  # of the time that is left, where all of it may be spent: what doe
 _LEAST = 1e-3
 _FLOOR = -300.0
 _BACKWARD = 20.0  # of work, where it is asked alone
-_BRIEF = (0.8, 0.4)  # of that, where it is asked among others, in three states and in two: for the rest once they
-# prove nothing; in three states less than that seldom proves anything
+_BRIEF = (0.8, 0.4)  # of that, where it is asked among others and nothing limits the time, in three states and in two:
+# for the rest once they prove nothing; in three states less than that seldom proves anything
 _RATIO, _RATIO_WITH_EFFORT = 1.05, 1.0001  # of the two bounds below which grids are not refined
 _CLOSE = 1.2  # ratio of the two bounds below which no other engine is needed
 
@@ -265,7 +265,8 @@ def backward_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer
         return EngineAnswer(applicable=False, method="backward", reason=SPARED)
     from certbound.values.kolmogorov import Bounds, bound_failing
 
-    brief = 1.0 if asked.thorough else _BRIEF[problem.system.dimension < 3]
+    whole = asked.thorough or seconds_left() < math.inf  # others have turns in between, and know what is left
+    brief = 1.0 if whole else _BRIEF[problem.system.dimension < 3]
     effort = brief if asked.effort is None else asked.effort
     answer = EngineAnswer(applicable=False, method="backward")
     try:
@@ -283,9 +284,11 @@ def backward_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer
 def _carried(problem: Problem, found: Any) -> EngineAnswer:
     cells = " x ".join(str(count) for count in found.cells)
     least, most = rounded(found.lower, up=False, digits=4), rounded(found.upper, up=True, digits=4)
-    below = f" and at least {least}" if found.lower > 0 else ""
+    known = [f"at most {most}"] * (found.upper < 1) + [f"at least {least}"] * (found.lower > 0)
     how = f"by a solution on {cells} cells whose error is carried"
-    reason = f"the probability of failing is at most {most}{below}, {how}"
+    reason = f"the probability of failing is {' and '.join(known)}, {how}"
+    if not known:
+        reason = f"nothing is proved of the probability of failing {how}"
     if found.lower > problem.delta:
         reason += f": more than the {problem.delta!r} that is asked, from some start"
     return EngineAnswer(
