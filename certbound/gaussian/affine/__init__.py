@@ -1,0 +1,1 @@
+"""Exit probabilities of affine models with additive Gaussian noise, at any stiffness and horizon."""

@@ -1,0 +1,8 @@
+"""Affine models with additive noise, exactly: no remainder, and a deviation whose law is known."""
+
+from __future__ import annotations
+
+from certbound.reach.affine.answer import AffineAnswer, affine_answer
+from certbound.reach.affine.reading import AffineModel, affine_model
+
+__all__ = ["affine_answer", "affine_model", "AffineAnswer", "AffineModel"]
