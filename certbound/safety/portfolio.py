@@ -31,6 +31,7 @@ from certbound.safety.certificates import (
 from certbound.safety.engines import (
     backward_engine,
     barrier_engine,
+    by_law,
     by_logarithms,
     constants_engine,
     in_coordinates,
@@ -141,7 +142,7 @@ ENGINES: dict[str, Engine] = {
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states; has lower bounds too, so that it answers UNSAFE",
-            prove=by_logarithms(in_coordinates(linear_engine), again=True),
+            prove=by_law(by_logarithms(in_coordinates(linear_engine), again=True)),
             write=of_coordinates(response_proof),
             again=True,
             chance=linear_chance,

@@ -1,0 +1,60 @@
+"""Affine models with additive noise first by their exact law, then by what has tubes and certificates."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+
+from certbound.errors import EngineError
+from certbound.problem.problem import Problem
+from certbound.reach.affine import AffineAnswer, affine_answer
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
+from certbound.watch import limited_to
+
+_TUBES = 3.0  # seconds for the tubes of a model whose law is known exactly
+
+Prove = Callable[..., EngineAnswer]
+
+
+def by_law(prove: Prove) -> Prove:
+    """The engine, after what the exact law of an affine model says; the lesser bound counts.
+
+    The engine has a few seconds then, for its tubes, and for a certificate that states its own bound.
+    """
+
+    def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+        law = affine_answer(problem) if asked.cells is None else None
+        if law is None:
+            return prove(problem, asked)
+        answer = _answer(law)
+        asked.found(answer)
+        if asked.quick:
+            return answer
+        tubes: EngineAnswer | None = None
+        with limited_to(_TUBES), contextlib.suppress(EngineError):
+            tubes = prove(problem, replace(asked, found=lambda _: None))
+        if tubes is None or not tubes.applicable:
+            return answer
+        return replace(tubes, conclusive=True) if tubes.log10_delta <= law.log10_delta else _joined(problem, answer, tubes)
+
+    return proved
+
+
+def _answer(law: AffineAnswer) -> EngineAnswer:
+    return EngineAnswer(
+        log10_delta=law.log10_delta, method="linear", details=law, foresight=True, conclusive=True,
+        by_limit=law.by_limit, reason=f"{law.reason}.",
+    )  # fmt: skip
+
+
+def _joined(problem: Problem, answer: EngineAnswer, tubes: EngineAnswer) -> EngineAnswer:
+    """The law's bound, with the tubes and the numbers of another answer that proves less."""
+    limits = answer.by_limit
+    if limits is not None and tubes.by_limit is not None:
+        limits = {limit: min(log, tubes.by_limit.get(limit, 0.0)) for limit, log in limits.items()}
+    short = tubes.margin is not None and tubes.margin < 0 and is_at_most(answer.log10_delta, problem.delta)
+    return replace(
+        tubes, log10_delta=answer.log10_delta, by_limit=limits, conclusive=True, reason=answer.reason, method="linear",
+        margin=None if short else tubes.margin, certified=True, foresight=True,
+    )  # fmt: skip
