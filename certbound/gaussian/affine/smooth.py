@@ -23,8 +23,9 @@ def _chord(first: Array, last: Array) -> Array:
 
 
 @quiet
-def smooth_parts(trace: Trace, lines: Array, chosen: Integers) -> tuple[Array, Array, Array]:
-    """What crossing ``lines`` (K, 2) costs: at the start, piece by piece, and about that without any enclosure.
+def smooth_parts(trace: Trace, lines: Array, chosen: Integers) -> tuple[Array, Array, Array, Array]:
+    """What crossing ``lines`` (K, 2) costs: at the start, piece by piece, about that without enclosures, and at the
+    highest rate of each piece.
 
     Natural logarithms; of the ``chosen`` pieces, which follow each other. The variance has the slope 2 c, so that it
     lies within h (sup c - inf c)/2 of its chord.
@@ -58,7 +59,8 @@ def smooth_parts(trace: Trace, lines: Array, chosen: Integers) -> tuple[Array, A
     e = 0.25 * (trace.e[0][pick] + trace.e[1][pick] + trace.e[0][after] + trace.e[1][after])
     at = np.repeat(levels.mean(axis=-1)[:, None], 2, axis=1)
     _, about, _ = log_crossings(spans, at, middle.ravel().clip(1e-290), flat(c), flat(e).clip(1e-290))
-    return first, _sums(rates), _sums(about)
+    peaks = np.max(rates.reshape(-1, PARTS), axis=1) + np.log(PARTS) + 1e-13
+    return first, _sums(rates), _sums(about), peaks
 
 
 def _sums(logs: Array) -> Array:

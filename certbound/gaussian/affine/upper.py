@@ -16,6 +16,7 @@ import numpy as np
 from flint import arb, arb_mat
 
 from certbound.arrays import Array, Integers
+from certbound.gaussian.affine.lagged import Costs, Spans, Watched, choose_marks, lagged_cost
 from certbound.gaussian.affine.law import AffineLaw, root_up
 from certbound.gaussian.affine.rough import Decays, lags_of, rough_parts
 from certbound.gaussian.affine.smooth import smooth_parts
@@ -28,6 +29,9 @@ _ROUNDS, _MOST = 60, 6000  # halvings one after the other, and pieces
 _LOOSE = 0.12  # in the exponent of a density, what the variance may move over a piece of a rough row
 _SMALL = 1e-3  # of the whole, shared by all pieces, below which a piece is left as it is
 _UNSURE = 1e-300
+_CERTAIN = 2.5  # logarithm of a number of crossings from which on nothing is said
+_MOST_STATES, _MOST_SIDES, _WATCHED = 80, 8, 12  # for first crossings: states, limits, and limits that marks watch
+_SHARE = -4.6  # logarithm of a limit's part of the whole, below which all its crossings count
 _LIKELY = -4.5  # logarithm of a probability from which on a product says more than a sum
 _HALVINGS, _PART, _HOPELESS = 12, 0.02, 12.0  # of pieces that cost more than that; what all may cost
 _PARTED = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
@@ -56,6 +60,7 @@ class Exit:
         self.smooth = all(x.is_zero() for x in (arb_mat([row]) * self.law.noise).entries())
         self.trace = Trace(self.law, row, full=not self.smooth)
         self.decays: Decays | None = None
+        self.peaks: dict[int, Array] = {}  # of smooth rows: the pieces' costs at their highest rates
         self.parts: list[tuple[float, Array, Integers]] = []  # of every limit: at its start, piece by piece, which
         self._refine()
 
@@ -77,7 +82,7 @@ class Exit:
             lines, _ = trace.rooms(limit.bound, limit.sign)
             chosen = self._chosen(limit)
             if self.smooth:
-                first, pieces, about = smooth_parts(trace, lines, chosen)
+                first, pieces, about, self.peaks[len(found)] = smooth_parts(trace, lines, chosen)
             else:
                 if self.decays is None:
                     self.decays = Decays(trace, lags_of(trace, self.law.horizon))
@@ -127,6 +132,12 @@ class Exit:
         first, pieces, _ = self.parts[number]
         return min(float(np.logaddexp.reduce(np.append(pieces, first))) + 1e-11, 0.0)
 
+    def costs_of(self, number: int) -> tuple[Costs, Array]:
+        """What crossings of a limit cost, piece by piece, each counted at its highest rate; and the pieces."""
+        _, pieces, chosen = self.parts[number]
+        peaks = self.peaks.get(number, pieces)
+        return Costs(times=self.trace.times, logs=peaks, lag=0.0), chosen
+
     def log_kept(self) -> float | None:
         """Logarithm of a lower bound of P(|a Z| stays within both rooms); None where it is not bounded from both sides.
 
@@ -143,6 +154,7 @@ class Exit:
             if not len(worst) or len(self.trace) > _MOST or np.sum(costs[0]) > _HOPELESS:
                 break
             self.trace.split(worst)
+            self.parts, _ = self._evaluate()
         return best if best > -np.inf else None
 
     def _two_sided(self) -> tuple[Array, Array]:
@@ -150,7 +162,7 @@ class Exit:
         trace, every = self.trace, np.arange(len(self.trace))
         lines = np.minimum(*(trace.rooms(limit.bound, limit.sign)[0] for limit in self.limits))
         if self.smooth:
-            first, pieces, _ = smooth_parts(trace, lines, every)
+            first, pieces, _, _ = smooth_parts(trace, lines, every)
         else:
             assert self.decays is not None
             first, pieces = rough_parts(trace, self.decays, lines, every)
@@ -182,19 +194,105 @@ class Exits:
 def bound_exits(law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit]) -> Exits:
     """Bound P(some limit is exceeded), for every start and disturbance of the law."""
     logs = [0.0] * len(limits)
-    parted, rest = 0.0, -np.inf
+    exits = []
     for direction, row in enumerate(rows):
         own = [place for place, limit in enumerate(limits) if limit.direction == direction]
         found = Exit(law, row, [limits[place] for place in own])
+        exits.append((found, own))
         for number, place in enumerate(own):
             logs[place] = found.log_of(number)
+    total = float(np.logaddexp.reduce(logs))
+    if total > _CERTAIN:
+        return Exits(log_probability=0.0, logs=tuple(logs))
+    total = min(total, _by_directions(exits, logs), _by_first_crossings(law, rows, limits, exits, logs))
+    return Exits(log_probability=min(total, 0.0), logs=tuple(logs))
+
+
+def _by_directions(exits: list[tuple[Exit, list[int]]], logs: list[float]) -> float:
+    """By the product over directions with two sides, beside the sum over all others."""
+    parted, rest = 0.0, -np.inf
+    for found, own in exits:
         whole = float(np.logaddexp.reduce([logs[place] for place in own]))
         kept = found.log_kept() if whole > _LIKELY else None
         if kept is None:
             rest = float(np.logaddexp(rest, whole))
         else:
             parted += kept
-    total = float(np.logaddexp.reduce(logs))
     product = np.log(-np.expm1(parted)) if parted < 0 else -np.inf
-    joined = float(np.logaddexp(rest, product)) + 1e-12
-    return Exits(log_probability=min(total, joined, 0.0), logs=tuple(logs))
+    return float(np.logaddexp(rest, product)) + 1e-12
+
+
+def _by_first_crossings(
+    law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit], exits: list[tuple[Exit, list[int]]],
+    logs: list[float],
+) -> float:
+    """By crossings that were within all limits a while before, where the mean stands still."""
+    resting = law.still and law.starts is None and not law.pushes and law.dimension <= _MOST_STATES
+    if not resting or any(limit.during is not None or limit.bound <= 0 for limit in limits):
+        return 0.0
+    top = float(np.logaddexp.reduce(logs))
+    spans = Spans(law)
+    watched = [Watched(row=tuple(rows[one.direction]), sign=one.sign, level=one.bound) for one in limits]
+    order = sorted(range(len(limits)), key=lambda place: -logs[place])
+    watched = [watched[place] for place in order[:_WATCHED]]
+    sides: list[Side] = []
+    known: dict[tuple[int, float], Side] = {}
+    for found, own in exits:
+        for number, place in enumerate(own):
+            limit = limits[place]
+            key = limit.direction, limit.bound
+            if key not in known:
+                after = None
+                if found.smooth and logs[place] > top + _SHARE and len(known) < _MOST_SIDES:
+                    marks = choose_marks(law, rows[limit.direction], limit.bound, 1, _seen(watched, limit.sign), spans)
+                    if marks:
+                        after = lagged_cost(law, rows[limit.direction], limit.bound, marks, spans)
+                known[key] = Side(exit=found, number=number, level=limit.bound, after=after)
+            sides.append(known[key])
+    if all(side.after is None for side in sides):
+        return 0.0
+    best = float(np.log(min(sum(side.cost(0.0, law.horizon) for side in sides), 1.0) + 1e-300))
+    symmetric = len(sides) == 2 * len(exits) and all(
+        limits[own[0]].sign != limits[own[1]].sign and limits[own[0]].bound == limits[own[1]].bound
+        for _, own in exits if len(own) == 2
+    )  # fmt: skip
+    if symmetric and best > _LIKELY:
+        for parts in _PARTED:
+            ends = np.linspace(0.0, law.horizon, parts + 1)
+            failing = [sum(side.cost(*pair) for side in sides) for pair in zip(ends[:-1].tolist(), ends[1:].tolist())]
+            if max(failing) < 1:
+                kept = float(np.sum(np.log1p(-np.array(failing)))) * (1 + 1e-12)
+                best = min(best, float(np.log(-np.expm1(kept))) + 1e-12)
+    return best + 1e-11
+
+
+def _seen(watched: list[Watched], sign: int) -> list[Watched]:
+    """The limits as they are for -X, where it is the lower side that is crossed: the law is symmetric."""
+    return [Watched(row=one.row, sign=sign * one.sign, level=one.level) for one in watched]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Side:
+    """One limit: what all crossings cost, and (``after``) what first crossings do from their longest lag on."""
+
+    exit: Exit
+    number: int
+    level: float
+    after: Costs | None
+
+    def cost(self, first: float, last: float) -> float:
+        """Upper bound of P(this limit is the first to be exceeded within [first, last] where that starts within all)."""
+        trace, (start, _, _) = self.exit.trace, self.exit.parts[self.number]
+        piece = int(np.clip(np.searchsorted(trace.times, first, side="right") - 1, 0, len(trace) - 1))
+        head = np.exp(start)
+        if first > 0:
+            high = trace.spread_of()[1][max(piece - 1, 0) : piece + 2].max()
+            head = float(np.exp(log_tail(self.level / root_up(high) * (1 - 1e-12))))
+        plain, _ = self.exit.costs_of(self.number)
+        middle = last
+        after = 0.0
+        if self.after is not None:
+            begun = first + self.after.lag
+            if begun < last:
+                middle, after = begun, self.after.between(begun, last)
+        return float(head + plain.between(first, middle) + after) * (1 + 1e-12)
