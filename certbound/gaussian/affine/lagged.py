@@ -29,8 +29,8 @@ from certbound.watch import poll
 
 _CELLS = np.concatenate([np.linspace(0.0, 5.0, 41), [5.5, 6.0, 7.0, 9.0]])  # of the speed, in standard deviations
 _MOST, _ROUNDS, _NEAR = 1500, 30, 0.02
-_PARTS, _LAGS, _EARLY = 4, 40, 0.2  # lags looked at: parts of a mean period, how many, and share of the horizon
-_MARKS, _GAIN = 3, 0.01  # marks, and what one must take from the crossings
+_PARTS, _LAGS, _EARLY = 4, 40, 0.5  # lags looked at: parts of a mean period, how many, and share of the horizon
+_MARKS, _GAIN = 4, 0.01  # marks, and what one must take from the crossings
 
 
 @dataclass(eq=False)
@@ -323,9 +323,13 @@ class Watched:
 
 
 def choose_marks(
-    law: AffineLaw, row: Sequence[float], level: float, sign: int, watched: Sequence[Watched], spans: Spans
+    law: AffineLaw, row: Sequence[float], level: float, watched: Sequence[Watched], spans: Spans,
+    early: Callable[[float], float],
 ) -> list[Mark]:
-    """Marks that take most from the crossings of sign * row X over a level, by floats and the law at the end."""
+    """Marks that take most from the crossings of row X over a level, by floats and the law at the end.
+
+    ``early``: the share of the crossings within so long a time from the start, in which none are taken.
+    """
     doubling = law.doubling
     final = doubling.gramian(GAIN, 0)
     if LOSS in doubling.sources:
@@ -334,7 +338,7 @@ def choose_marks(
         forward = doubling.transition(0)
         final = final + forward * law.covariance * forward.transpose()
     cov, slope = _plain(final), _plain(law.slope)
-    own = sign * np.asarray(row, dtype=float)
+    own = np.asarray(row, dtype=float)
     fast = own @ slope
     s2, e2 = float(own @ cov @ own), float(fast @ cov @ fast)
     if not (s2 > 0 and e2 > 0):
@@ -363,10 +367,10 @@ def choose_marks(
     gaps = ((levels - to_x / s2 * level)[..., None] - to_e[..., None] * u) / deviation[..., None]
     worth = np.where(usable, np.exp(log_tail(gaps)) @ weight, 0.0)
     chosen: list[tuple[int, int]] = []
-    early = (lags * unit / law.horizon)[:, None]  # share of the time in which no such crossings are counted
+    before = np.array([early(lag * unit) for lag in lags.tolist()])[:, None]
     while len(chosen) < _MARKS:
-        lost = max((float(early[lag, 0]) for lag, _ in chosen), default=0.0)
-        score = worth - np.maximum(early - lost, 0.0)
+        lost = max((float(before[lag, 0]) for lag, _ in chosen), default=0.0)
+        score = worth - np.maximum(before - lost, 0.0)
         lag, number = (int(x) for x in np.unravel_index(int(np.argmax(score)), score.shape))
         if score[lag, number] < _GAIN:
             break

@@ -244,7 +244,12 @@ def _by_first_crossings(
             if key not in known:
                 after = None
                 if found.smooth and logs[place] > top + _SHARE and len(known) < _MOST_SIDES:
-                    marks = choose_marks(law, rows[limit.direction], limit.bound, 1, _seen(watched, limit.sign), spans)
+                    plain, _ = found.costs_of(number)
+                    whole = plain.between(0.0, law.horizon) + 1e-300
+                    marks = choose_marks(
+                        law, rows[limit.direction], limit.bound, _seen(watched, limit.sign), spans,
+                        lambda lag, plain=plain, whole=whole: plain.between(0.0, lag) / whole,
+                    )
                     if marks:
                         after = lagged_cost(law, rows[limit.direction], limit.bound, marks, spans)
                 known[key] = Side(exit=found, number=number, level=limit.bound, after=after)
