@@ -24,13 +24,14 @@ from certbound.gaussian.scalar import log_below_above, log_tail, log_tail_below
 from certbound.rigor.rounding import quiet
 from certbound.watch import poll
 
-_STEPS = (16, 32, 64, 128, 200)  # of a short horizon
+_STEPS = (32, 128)  # of a short horizon
+_MANY = 3  # rows from which on the coarser ones serve
 _LONG = 60.0  # mean periods from which on a horizon is long
 _PERIODS = (0.08, 0.15, 0.3)  # parts of a mean period between events of a long horizon
 _LATE = 12  # halvings of the horizon, after one of which the law hardly changes
 _CHANGED = 1e-3  # of a variance, for which that holds
 _LAGS = 512
-_FAR = 0.02  # correlation at which lags end
+_OPPOSITE = 0.999  # of a correlation: nearer to -1 bounds of pairs lose their accuracy
 
 Asked = tuple[int, int, float]
 """Number of a row, sign, bound."""
@@ -49,7 +50,7 @@ def bound_exits_below(law: AffineLaw, rows: Sequence[Sequence[float]], asked: Se
     best = 0.0
     shortest = min(periods)
     if law.horizon <= _LONG * shortest or not law.still:
-        for steps in _STEPS:
+        for steps in _STEPS[: 1 if len(own) > _MANY else None]:
             poll("events at single times")
             best = max(best, _short(law, own, events, steps))
     late = _late(law, own)
@@ -75,11 +76,11 @@ def _period(law: AffineLaw, row: list[arb]) -> float:
 
 def _pair(first: Array, second: Array, high: Array) -> Array:
     """Upper bounds of P(X > first, Y > second) for correlations of at most ``high``."""
-    return np.exp(log_below_above(-first, second, np.clip(-high, -1.0, 1.0)))
+    return np.exp(log_below_above(-first, second, np.clip(-high, -1.0, _OPPOSITE)))
 
 
 def _short(law: AffineLaw, rows: list[list[arb]], events: list[Asked], steps: int) -> float:
-    """By all pairs of times k T/steps, k = 1, ..., steps (a power of two of them, or fewer)."""
+    """By all pairs of times k T/steps, k = 1, ..., steps (a power of two)."""
     doubling = law.doubling
     level = int(np.ceil(np.log2(steps)))
     moved = []  # (steps + 1, n) rows of every direction
@@ -95,11 +96,9 @@ def _short(law: AffineLaw, rows: list[list[arb]], events: list[Asked], steps: in
     low, high = np.zeros((2, count, count, steps, steps))
     for i in range(count):
         image = arb_mat(moved[i]) * gramian
-        start = None if law.covariance is None else arb_mat(moved[i]) * law.covariance
         for j in range(count):
             back = arb_mat(moved[j]).transpose()
             products = rows_of(image * back)
-            starts = None if start is None else rows_of(start * back)
             entries = []
             places = []
             for m in range(steps):
@@ -108,11 +107,9 @@ def _short(law: AffineLaw, rows: list[list[arb]], events: list[Asked], steps: in
                     total = total + products[k - 1][k - 1 + m]
                     entries.append(total)
                     places.append((k - 1, k - 1 + m))
-            if law.covariance is not None:  # V = V_0 + V+ - V-
-                whole = rows_of(arb_mat([rows[i]]) * law.covariance)[0]
-                del whole
-                assert starts is not None
-                constant = _constant(law, moved[i], moved[j], steps)
+            if law.covariance is not None:  # V = V_0 + V+ - V-: what V_0 adds depends on the lag alone
+                own = rows_of(arb_mat([moved[i][0]]) * law.covariance)[0]
+                constant = [dot(own, moved[j][m]) for m in range(steps)]
                 entries = [entry + constant[b - a] for entry, (a, b) in zip(entries, places)]
             a, b = (np.array(part) for part in zip(*places))
             low[i, j, a, b], high[i, j, a, b] = floats(entries)
@@ -122,7 +119,7 @@ def _short(law: AffineLaw, rows: list[list[arb]], events: list[Asked], steps: in
     means = [[dot(row, law.mean.entries()) for row in moved[i][1:]] for i in range(count)]
     levels, most, singles, signs, owner = [], [], [], [], []
     for i, sign, bound in events:
-        room = floats([sign * (arb(bound) - sign * mean) * sign for mean in means[i]])
+        room = floats([arb(bound) - sign * mean for mean in means[i]])
         with np.errstate(divide="ignore", invalid="ignore"):
             small = np.minimum(room[0] / deviation[i, 1], room[0] / deviation[i, 0]) * 1.0
             large = np.maximum(room[1] / deviation[i, 0], room[1] / deviation[i, 1])
@@ -155,13 +152,6 @@ def _short(law: AffineLaw, rows: list[list[arb]], events: list[Asked], steps: in
     with np.errstate(divide="ignore", invalid="ignore"):
         value = float(np.sum(np.where(p > 0, p * p / sums, 0.0))) * (1 - 1e-11)
     return min(max(value, float(p.max(initial=0.0)) * (1 - 1e-12)), 1.0)
-
-
-def _constant(law: AffineLaw, first: list[list[arb]], second: list[list[arb]], steps: int) -> list[arb]:
-    """a V_0 F(m d)^T a' for every lag m: what V_0 adds, which does not move."""
-    assert law.covariance is not None
-    image = rows_of(arb_mat([first[0]]) * law.covariance)[0]
-    return [dot(image, second[m]) for m in range(steps)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -183,6 +183,8 @@ def rough_parts(trace: Trace, decays: Decays, lines: Array, chosen: Integers) ->
 
 def _cost(spans: Array, levels: Array) -> Array:
     """Logs of P(below the level at a block's start, above it within the block), one block each."""
+    if not len(spans):
+        return np.zeros(0)
     counts = np.clip(np.ceil(spans * np.maximum(levels, 0.5) ** 2 / _WEIGHT), 1, _MOST).astype(int)
     own, parts = np.repeat(levels, counts), np.maximum(np.repeat(spans / counts * (1 + 1e-15), counts), 1e-12)
     heads = np.cumsum(counts) - counts

@@ -191,8 +191,10 @@ class Exits:
     logs: tuple[float, ...]
 
 
-def bound_exits(law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit]) -> Exits:
-    """Bound P(some limit is exceeded), for every start and disturbance of the law."""
+def bound_exits(
+    law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit], *, plainly: bool = False
+) -> Exits:
+    """Bound P(some limit is exceeded), for every start and disturbance of the law; ``plainly`` by the sum of limits."""
     logs = [0.0] * len(limits)
     exits = []
     for direction, row in enumerate(rows):
@@ -202,8 +204,8 @@ def bound_exits(law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequenc
         for number, place in enumerate(own):
             logs[place] = found.log_of(number)
     total = float(np.logaddexp.reduce(logs))
-    if total > _CERTAIN:
-        return Exits(log_probability=0.0, logs=tuple(logs))
+    if plainly or total > _CERTAIN:
+        return Exits(log_probability=min(total, 0.0), logs=tuple(logs))
     total = min(total, _by_directions(exits, logs), _by_first_crossings(law, rows, limits, exits, logs))
     return Exits(log_probability=min(total, 0.0), logs=tuple(logs))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certbound.reach.affine.answer import AffineAnswer, affine_answer
+from certbound.reach.affine.answer import AffineAnswer, AffineFailing, affine_answer, affine_failing
 from certbound.reach.affine.reading import AffineModel, affine_model
 
-__all__ = ["affine_answer", "affine_model", "AffineAnswer", "AffineModel"]
+__all__ = ["affine_answer", "affine_failing", "affine_model", "AffineAnswer", "AffineFailing", "AffineModel"]
