@@ -39,8 +39,8 @@ class AffineAnswer:
         return f"the exact law of the linear model gives {log10_text(self.logs[worst])} for '{self.model.names[worst]}'"
 
 
-def affine_answer(problem: Problem) -> AffineAnswer | None:
-    """The answer; None where the model is not affine, its noise not additive, or its limits are no fixed half-spaces.
+def affine_answer(problem: Problem, *, plainly: bool = False) -> AffineAnswer | None:
+    """The answer, ``plainly`` the sum over limits; None where the model is not affine, its noise not additive, or its limits are no fixed half-spaces.
 
     Balls take as many bits as keep every variance accurate, whatever the stiffness.
     """
@@ -50,7 +50,7 @@ def affine_answer(problem: Problem) -> AffineAnswer | None:
     for bits in _BITS:
         with ctx.workprec(bits):
             try:
-                found = bound_exits(model.law(), model.rows, model.limits)
+                found = bound_exits(model.law(), model.rows, model.limits, plainly=plainly)
             except Inaccurate:
                 continue
         logs = tuple(_log10(log) for log in found.logs)
