@@ -16,6 +16,7 @@ from certbound.checks import instance
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
+from certbound.safety.affine_laws import by_law, of_laws
 from certbound.safety.answers import EngineAnswer, Proof, Request
 from certbound.safety.certificates import (
     backward_proof,
@@ -31,7 +32,6 @@ from certbound.safety.certificates import (
 from certbound.safety.engines import (
     backward_engine,
     barrier_engine,
-    by_law,
     by_logarithms,
     constants_engine,
     in_coordinates,
@@ -125,6 +125,8 @@ def _polynomials(problem: Problem) -> float:
     return 0.5 if problem.system.dimension > 1 else math.inf
 
 
+_LINEAR = by_logarithms(in_coordinates(linear_engine), again=True)
+
 ENGINES: dict[str, Engine] = {
     row.name: row
     for row in (
@@ -142,8 +144,8 @@ ENGINES: dict[str, Engine] = {
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states; has lower bounds too, so that it answers UNSAFE",
-            prove=by_law(by_logarithms(in_coordinates(linear_engine), again=True)),
-            write=of_coordinates(response_proof),
+            prove=by_law(_LINEAR),
+            write=of_laws(of_coordinates(response_proof), _LINEAR),
             again=True,
             chance=linear_chance,
             below=linear_below,

@@ -1,11 +1,11 @@
 """Lower bounds of P(some limit is exceeded) for an affine law, from one start and the middle of the disturbances.
 
-The events A_k = {sign * (a X_t) > b} at a grid of times, for some rows and both signs, are joined by de Caen's inequality
-P(A_1 or A_2 or ...) >= sum_k P(A_k)^2 / sum_l P(A_k and A_l). Over a short horizon all covariances follow from the rows
-r_l = a F(l d) alone, cov(a Z_i, a' Z_{i+m}) = sum_{l<i} r_l Q(d) r'_{l+m} + r_i V_0 r'_{i+m}. Over a long one the law of
-a late part hardly changes: with V(s) between V(t_s) and V(t_s) + D a covariance moves by sqrt(r D r . a D a) at most, so
-that pairs are looked at lag by lag, and those beyond the last lag x have a correlation of at most the root of (s^2 - a
-Q(x) a)/s^2.
+The events A_k = {sign * (a X_t) > b} at a grid of times, for some rows and both signs, are joined by de Caen's
+inequality P(A_1 or A_2 or ...) >= sum_k P(A_k)^2 / sum_l P(A_k and A_l). Over a short horizon all covariances follow
+from the rows r_l = a F(l d) alone, cov(a Z_i, a' Z_{i+m}) = sum_{l<i} r_l Q(d) r'_{l+m}, and a V_0 r'_m for a random
+start. Over a long one the law of a late part hardly changes: with V(s) between V(t_s) and V(t_s) + D a covariance moves
+by sqrt(r D r . a D a) at most, so that pairs are looked at lag by lag, and those beyond the last lag x have a
+correlation of at most the root of (s^2 - a Q(x) a)/s^2.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ def _short(law: AffineLaw, rows: list[list[arb]], events: list[Asked], steps: in
                     entries.append(total)
                     places.append((k - 1, k - 1 + m))
             if law.covariance is not None:  # V = V_0 + V+ - V-: what V_0 adds depends on the lag alone
-                own = rows_of(arb_mat([moved[i][0]]) * law.covariance)[0]
-                constant = [dot(own, moved[j][m]) for m in range(steps)]
+                spread = rows_of(arb_mat([moved[i][0]]) * law.covariance)[0]
+                constant = [dot(spread, moved[j][m]) for m in range(steps)]
                 entries = [entry + constant[b - a] for entry, (a, b) in zip(entries, places)]
             a, b = (np.array(part) for part in zip(*places))
             low[i, j, a, b], high[i, j, a, b] = floats(entries)

@@ -1,10 +1,12 @@
 """First crossings of a smooth row: upcrossings that were not beyond the limits a while before.
 
-A path that first fails at a time t crosses upwards there, and was within the limits at t - x_1, t - x_2, ... With eta = d xi/dt the expected number of such crossings is int phi(z/s)/s E[eta^+; all y_i <= z_i | xi_t = z] dt with the y_i the
-marks: values of this row or others at lags, 0 among them (Rice's formula for marked crossings). Under xi_t = z the speed
-is normal with the mean c z/s^2 and the variance v^2; over cells of it the y_i are normal variables, and P(some y_i >
-z_i) is bounded from below by pairs. This counts few of the crossings of a clump. All of these are rows of the state Z
-at the earliest time plus noise that follows, so that their covariances are enclosed as those of one row (`trace`).
+A path that first fails at a time t crosses upwards there, and was within the limits at t - x_1, t - x_2, ... With eta =
+d xi/dt the expected number of such crossings is int phi(z/s)/s E[eta^+; all y_i <= z_i | xi_t = z] dt with the y_i the
+marks: values of this row or others at lags, 0 among them (Rice's formula for marked crossings). Under xi_t = z the
+speed is normal with the mean c z/s^2 and the variance v^2; over cells of it the y_i are normal variables, and P(some
+y_i > z_i) is bounded from below by pairs. This counts few of the crossings of a clump. All of these are rows of the
+state Z at the earliest time plus noise that follows, so that their covariances are enclosed as those of one row
+(`trace`).
 """
 
 from __future__ import annotations
@@ -18,10 +20,15 @@ from flint import arb, arb_mat
 from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.doubling import Doubling
 from certbound.gaussian.affine.law import GAIN, LOSS, AffineLaw, floats, root_up, transposed_square
-from certbound.gaussian.affine.trace import Row, _square, dot, rows_of
-from certbound.gaussian.scalar import log_below_above, log_tail, log_tail_below
-from certbound.gaussian.scalar.normal import LOG_ROOT_2PI, log_between
-from certbound.gaussian.scalar.rice import log_crossings
+from certbound.gaussian.affine.trace import Row, dot, rows_of, square_of
+from certbound.gaussian.scalar import (
+    LOG_ROOT_2PI,
+    log_below_above,
+    log_between,
+    log_crossings,
+    log_tail,
+    log_tail_below,
+)
 from certbound.rigor import intervals as iv
 from certbound.rigor.intervals import Interval
 from certbound.rigor.rounding import quiet
@@ -72,7 +79,7 @@ class Joint:
             for k, node in enumerate(nodes):
                 own = images[k * count : (k + 1) * count]
                 for i in range(count):
-                    square = _square(node[i], own[i])
+                    square = square_of(node[i], own[i])
                     squares.append(square)
                     for j in range(i + 1):
                         value = square if i == j else dot(own[i], node[j])
@@ -221,7 +228,7 @@ def _logs(found: dict[tuple[int, int], Interval], z: float, marks: Sequence[Mark
         turns.append(turn)
         owns.append(own)
     beyond = _any_beyond(levels, lambda i, j: _correlation(given, turns, owns, marks, i, j))
-    # int u phi(u - k) over a cell is -[phi(u - k)] + k [Phi(u - k)]; other k within d of it change phi by exp(|u - k| d)
+    # int u phi(u - k) over a cell is -[phi(u - k)] + k [Phi(u - k)]; k moved by d changes phi by exp(|u - k| d) at most
     middle, away = mean.mid[None], mean.rad[None] * (1 + 1e-12)
     parts = (np.exp(-0.5 * (low - middle) ** 2) - np.exp(-0.5 * (high - middle) ** 2)) * np.exp(-LOG_ROOT_2PI)
     parts = parts + middle * np.exp(log_between(low - middle, high - middle))
@@ -275,8 +282,9 @@ def lagged_cost(law: AffineLaw, row: Sequence[float], level: float, marks: Seque
     for _ in range(_ROUNDS):
         keys = list(zip(joint.levels.tolist(), joint.indices))
         new = [k for k, key in enumerate(keys) if key not in known]
-        for k, *values in zip(new, *(x.tolist() for x in lagged_parts(joint, level, marks, np.array(new, dtype=np.intp)))):
-            known[keys[k]] = values[0], values[1]
+        found = lagged_parts(joint, level, marks, np.array(new, dtype=np.intp))
+        for k, value, guess in zip(new, *(part.tolist() for part in found)):
+            known[keys[k]] = value, guess
         pieces, about = np.array([known[key] for key in keys]).T
         top = float(np.max(np.where(np.isfinite(pieces), pieces, -np.inf), initial=-np.inf))
         top = top if np.isfinite(top) else 0.0
@@ -303,6 +311,10 @@ class Costs:
     times: Array
     logs: Array
     lag: float
+
+    def share(self, last: float) -> float:
+        """What part of the whole the time until ``last`` costs."""
+        return self.between(self.times[0], last) / (self.between(self.times[0], self.times[-1]) + 1e-300)
 
     def between(self, first: float, last: float) -> float:
         """What an interval of time costs, which no piece may be missing from."""
@@ -375,13 +387,15 @@ def choose_marks(
         if score[lag, number] < _GAIN:
             break
         chosen.append((lag, number))
-        later = np.where((lags <= lag)[:, None], ahead[np.abs(lag - lags), :, number], ahead[np.abs(lag - lags), number, :])
+        apart = np.abs(lag - lags)
+        later = np.where((lags <= lag)[:, None], ahead[apart, :, number], ahead[apart, number, :])
         rho = (later - to_x * to_x[lag, number] / s2 - to_e * to_e[lag, number]) / (deviation * deviation[lag, number])
         rho = np.clip(np.nan_to_num(rho), -1.0, 1.0)[..., None] * np.ones(len(u))
         both = np.exp(log_below_above(-gaps, np.broadcast_to(gaps[lag, number], gaps.shape), -rho)) @ weight
         worth = np.maximum(worth - both, 0.0)
         worth[lag, number] = 0.0
-    return [Mark(row=watched[j].row, lag=float(i * unit), sign=watched[j].sign, level=watched[j].level) for i, j in chosen]
+    pairs = [(float(lag * unit), watched[number]) for lag, number in chosen]
+    return [Mark(row=one.row, lag=lag, sign=one.sign, level=one.level) for lag, one in pairs]
 
 
 def _plain(matrix: arb_mat) -> Array:

@@ -18,8 +18,7 @@ from flint import arb_mat
 from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.law import floats, root_up
 from certbound.gaussian.affine.trace import Trace, dot, rows_of
-from certbound.gaussian.scalar import log_line_crossing, log_polygon_crossing, log_tail
-from certbound.gaussian.scalar.normal import lift, log_between
+from certbound.gaussian.scalar import lift, log_between, log_line_crossing, log_polygon_crossing, log_tail
 from certbound.rigor.rounding import quiet
 
 _PARTS = 8  # cells of lags between two doublings

@@ -6,7 +6,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.trace import Trace
-from certbound.gaussian.scalar.rice import log_crossings
+from certbound.gaussian.scalar import log_crossings
 from certbound.rigor.rounding import quiet
 
 PARTS = 8  # of a piece, over each of which the variance is enclosed about its chord
@@ -54,7 +54,8 @@ def smooth_parts(trace: Trace, lines: Array, chosen: Integers) -> tuple[Array, A
         start_variance=start,
     )  # fmt: skip
     rates[1:] = np.logaddexp(rates[1:], jumps)
-    middle = 0.5 * (_chord(trace.s[0][pick], trace.s[0][after])[:, :-1] + _chord(trace.s[1][pick], trace.s[1][after])[:, 1:])
+    chords = [_chord(end[pick], end[after]) for end in trace.s]
+    middle = 0.5 * (chords[0][:, :-1] + chords[1][:, 1:])
     c = 0.5 * (c_low + c_high)
     e = 0.25 * (trace.e[0][pick] + trace.e[1][pick] + trace.e[0][after] + trace.e[1][after])
     at = np.repeat(levels.mean(axis=-1)[:, None], 2, axis=1)

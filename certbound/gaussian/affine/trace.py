@@ -1,12 +1,12 @@
 """A row of an affine law over time: pieces of time, halved where that pays, with enclosures over each whole piece.
 
-For a row a let r(t) = a F(t), q = r A. With xi = a Z: s^2 = Var xi, c = cov(xi, a A Z) and e = Var(a A Z). From a piece's
-start t_k on, V changes by D+ - D- with 0 <= D+(t) <= D+(h), the same for D-. So s^2 lies within [s_k^2 - r Q-(h) r,
-s_k^2 + r Q+(h) r], e likewise, and c within half of sqrt(r Q+ r . q Q+ q) + sqrt(r Q- r . q Q- q) of the mean of its
-ends, since 2 D(t) - D(h) lies between -D(h) and D(h). None of that asks how fast the model is.
+For a row a let r(t) = a F(t), q = r A. With xi = a Z: s^2 = Var xi, c = cov(xi, a A Z) and e = Var(a A Z). From a
+piece's start t_k on, V changes by D+ - D- with 0 <= D+(t) <= D+(h), the same for D-. So s^2 lies within [s_k^2 - r
+Q-(h) r, s_k^2 + r Q+(h) r], e likewise, and c within half of sqrt(r Q+ r . q Q+ q) + sqrt(r Q- r . q Q- q) of the mean
+of its ends, since 2 D(t) - D(h) lies between -D(h) and D(h). None of that asks how fast the model is.
 
-The mean u(t) = r(t) x lies within h^(3/2)/sqrt(48) of its chord, times the root of int u''^2 = (q A) Q_x(h) (q A)^T with
-the Gramian Q_x of x x^T (Cauchy and Schwarz with Green's function of the chord).
+The mean u(t) = r(t) x lies within h^(3/2)/sqrt(48) of its chord, times the root of int u''^2 = (q A) Q_x(h) (q A)^T
+with the Gramian Q_x of x x^T (Cauchy and Schwarz with Green's function of the chord).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def rows_of(matrix: arb_mat) -> list[Row]:
     return [entries[i : i + columns] for i in range(0, len(entries), columns)]
 
 
-def _square(row: Row, image: Row) -> arb:
+def square_of(row: Row, image: Row) -> arb:
     """r Q r^T from r and r Q: not negative."""
     value = dot(row, image)
     return value if value >= 0 else arb(0).union(abs(value).upper()) if value.is_finite() else value
@@ -66,9 +66,8 @@ class Trace:
         if law.covariance is not None:
             image = rows_of(arb_mat([self.row]) * law.covariance)[0]
             own = rows_of(arb_mat([self.row]) * law.slope)[0]
-            starts = [_square(self.row, image), dot(image, own),
-                      _square(own, rows_of(arb_mat([own]) * law.covariance)[0])]
-        self._kept: dict[str, list[arb]] = {}
+            starts = [square_of(self.row, image), dot(image, own),
+                      square_of(own, rows_of(arb_mat([own]) * law.covariance)[0])]
         zero = arb_mat(n, n)
         self.matrices = [(zero, zero)] if self.full else []
         self._ends: list[list[arb]] = [starts, []]
@@ -114,8 +113,8 @@ class Trace:
             if name in doubling.sources:
                 gramian = doubling.gramian(name, level)
                 images, own_images = rows_of(matrix * gramian), rows_of(moved * gramian)
-                squares = [_square(r, image) for r, image in zip(rows, images)]
-                speeds = [_square(q, image) for q, image in zip(own, own_images)]
+                squares = [square_of(r, image) for r, image in zip(rows, images)]
+                speeds = [square_of(q, image) for q, image in zip(own, own_images)]
                 for change, r2, image, q, q2 in zip(changes, squares, images, own, speeds):
                     change[0] += sign * r2
                     change[1] += sign * dot(image, q)
@@ -130,13 +129,13 @@ class Trace:
             error = np.zeros(len(rows))
             if name in doubling.sources:
                 images = rows_of(turned * doubling.gramian(name, level))
-                squares = [_square(r, image) for r, image in zip(rows_of(turned), images)]
+                squares = [square_of(r, image) for r, image in zip(rows_of(turned), images)]
                 error = root_up(floats(squares)[1]) * step**1.5 * _CHORD * factor * (1 + 1e-12)
             result[f"{name} error"] = error.tolist()
         pushed = np.zeros(len(rows))
         for place in range(len(law.pushes)):
             images = rows_of(matrix * doubling.gramian(f"push{place}", level))
-            squares = [_square(r, image) for r, image in zip(rows, images)]
+            squares = [square_of(r, image) for r, image in zip(rows, images)]
             pushed += root_up(floats(squares)[1]) * np.sqrt(step) * (1 + 1e-12)
         result["pushed"] = pushed.tolist()
         return result, changes
@@ -187,7 +186,8 @@ class Trace:
             for name in columns:
                 columns[name] += [half[name] for half in halves]
         self.levels, self.indices, self.rows = np.array(levels, dtype=np.intp), indices, rows
-        self._ends, self._means, self._wides = [*ends, self._ends[-1]], [*means, self._means[-1]], [*wides, self._wides[-1]]
+        self._ends, self._means = [*ends, self._ends[-1]], [*means, self._means[-1]]
+        self._wides = [*wides, self._wides[-1]]
         if self.full:
             self.matrices = [*matrices_, self.matrices[-1]]
         self.columns = {name: np.array(values) for name, values in columns.items()}
@@ -201,7 +201,8 @@ class Trace:
         if not (np.isfinite(top) and np.all(self.s[1] - self.s[0] <= _ACCURATE * self.s[1] + 1e-30 * top + 1e-290)):
             raise Inaccurate
         self.mean, self.wide = floats(self._means), floats(self._wides)[1]
-        self.steps = np.array([float(self.law.doubling.step(int(level))) for level in self.levels])  # exact: powers of two of the horizon
+        step = self.law.doubling.step
+        self.steps = np.array([float(step(int(level))) for level in self.levels])  # exact: halves of halves
         self.times = np.array(
             [float(self.law.doubling.step(int(level)) * index) for level, index in zip(self.levels, self.indices)]
             + [self.law.horizon]
@@ -225,7 +226,8 @@ class Trace:
 
     def cross_of(self) -> tuple[Array, Array]:
         """Enclosure of c over each piece."""
-        half = 0.5 * sum(root_up(self.columns[f"{name} s"]) * root_up(self.columns[f"{name} e"]) for name in (GAIN, LOSS))
+        columns = self.columns
+        half = 0.5 * sum(root_up(columns[f"{name} s"]) * root_up(columns[f"{name} e"]) for name in (GAIN, LOSS))
         low = 0.5 * (self.c[0][:-1] + self.c[0][1:])
         high = 0.5 * (self.c[1][:-1] + self.c[1][1:])
         slack = half * (1 + 1e-14) + 4e-16 * (np.abs(low) + np.abs(high)) + 1e-300

@@ -76,7 +76,8 @@ class Exit:
     def _evaluate(self) -> tuple[list[tuple[float, Array, Integers]], Array]:
         """What every limit costs, and which pieces are worth being halved (a weight each)."""
         trace = self.trace
-        found, gaps = [], np.zeros(len(trace))
+        found: list[tuple[float, Array, Integers]] = []
+        gaps = np.zeros(len(trace))
         logs = []
         for limit in self.limits:
             lines, _ = trace.rooms(limit.bound, limit.sign)
@@ -90,8 +91,8 @@ class Exit:
                 about = np.where(self._loose(lines)[chosen], -np.inf, pieces)
             found.append((float(first[0]), pieces, chosen))
             logs.append((pieces, about, chosen))
-        top = max((float(np.max(np.where(np.isfinite(p), p, -np.inf), initial=-np.inf)) for p, _, _ in logs))
-        top = max(top, max((part[0] for part in found)))
+        top = max(float(np.max(np.where(np.isfinite(p), p, -np.inf), initial=-np.inf)) for p, _, _ in logs)
+        top = max(top, max(part[0] for part in found))
         top = top if np.isfinite(top) else 0.0
         for pieces, about, chosen in logs:
             gap = np.exp(np.minimum(pieces - top, 700.0)) - np.exp(np.minimum(about - top, 700.0))
@@ -132,11 +133,10 @@ class Exit:
         first, pieces, _ = self.parts[number]
         return min(float(np.logaddexp.reduce(np.append(pieces, first))) + 1e-11, 0.0)
 
-    def costs_of(self, number: int) -> tuple[Costs, Array]:
-        """What crossings of a limit cost, piece by piece, each counted at its highest rate; and the pieces."""
-        _, pieces, chosen = self.parts[number]
-        peaks = self.peaks.get(number, pieces)
-        return Costs(times=self.trace.times, logs=peaks, lag=0.0), chosen
+    def costs_of(self, number: int) -> Costs:
+        """What crossings of a limit cost, piece by piece, each counted at its highest rate."""
+        peaks = self.peaks.get(number, self.parts[number][1])
+        return Costs(times=self.trace.times, logs=peaks, lag=0.0)
 
     def log_kept(self) -> float | None:
         """Logarithm of a lower bound of P(|a Z| stays within both rooms); None where it is not bounded from both sides.
@@ -246,12 +246,8 @@ def _by_first_crossings(
             if key not in known:
                 after = None
                 if found.smooth and logs[place] > top + _SHARE and len(known) < _MOST_SIDES:
-                    plain, _ = found.costs_of(number)
-                    whole = plain.between(0.0, law.horizon) + 1e-300
-                    marks = choose_marks(
-                        law, rows[limit.direction], limit.bound, _seen(watched, limit.sign), spans,
-                        lambda lag, plain=plain, whole=whole: plain.between(0.0, lag) / whole,
-                    )
+                    seen, early = _seen(watched, limit.sign), found.costs_of(number).share
+                    marks = choose_marks(law, rows[limit.direction], limit.bound, seen, spans, early)
                     if marks:
                         after = lagged_cost(law, rows[limit.direction], limit.bound, marks, spans)
                 known[key] = Side(exit=found, number=number, level=limit.bound, after=after)
@@ -288,14 +284,14 @@ class Side:
     after: Costs | None
 
     def cost(self, first: float, last: float) -> float:
-        """Upper bound of P(this limit is the first to be exceeded within [first, last] where that starts within all)."""
+        """Upper bound of P(this limit is the first to be exceeded within [first, last]), which starts within all."""
         trace, (start, _, _) = self.exit.trace, self.exit.parts[self.number]
         piece = int(np.clip(np.searchsorted(trace.times, first, side="right") - 1, 0, len(trace) - 1))
         head = np.exp(start)
         if first > 0:
             high = trace.spread_of()[1][max(piece - 1, 0) : piece + 2].max()
             head = float(np.exp(log_tail(self.level / root_up(high) * (1 - 1e-12))))
-        plain, _ = self.exit.costs_of(self.number)
+        plain = self.exit.costs_of(self.number)
         middle = last
         after = 0.0
         if self.after is not None:

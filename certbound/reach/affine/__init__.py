@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from certbound.reach.affine.answer import AffineAnswer, AffineFailing, affine_answer, affine_failing
-from certbound.reach.affine.reading import AffineModel, affine_model
+from certbound.reach.affine.exit_bounds import AffineAnswer, AffineFailing, affine_answer, affine_failing
 
-__all__ = ["affine_answer", "affine_failing", "affine_model", "AffineAnswer", "AffineFailing", "AffineModel"]
+__all__ = ["affine_answer", "affine_failing", "AffineAnswer", "AffineFailing"]

@@ -11,8 +11,7 @@ import numpy as np
 from flint import arb, arb_mat
 
 from certbound.errors import InfeasibleError
-from certbound.gaussian.affine.law import AffineLaw
-from certbound.gaussian.affine.upper import Limit
+from certbound.gaussian.affine import AffineLaw, Limit
 from certbound.problem.model import Tape, edged, jacobian, reads, varying_outputs
 from certbound.problem.problem import Problem
 from certbound.problem.sets import Box, Faces
@@ -33,7 +32,7 @@ BALLS: dict[str, Callable[..., arb]] = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AffineModel:
-    """Rows of the limits' directions, and the limits (``names``, ``places``: label, and numbers of constraint, limit)."""
+    """Rows of the limits' directions, and the limits: their ``names``, and numbers of constraint and limit."""
 
     problem: Problem
     rows: tuple[tuple[float, ...], ...]
@@ -68,15 +67,15 @@ class AffineModel:
             starts = arb_mat(size, len(wide))
             for column, i in enumerate(wide):
                 starts[i, column] = (arb(float(hull.hi[i])) - arb(float(hull.lo[i]))) / 2
-        pushes = []
+        pushes: list[arb_mat] = []
         if box is not None:
             gains = _values(problem, middle, _by_disturbances(problem))
             count = len(middle)
             for j, (a, b) in enumerate(zip(box.low.tolist(), box.high.tolist())):
-                column = arb_mat(size, 1)
+                push = arb_mat(size, 1)
                 for i in range(n):
-                    column[i, 0] = gains[i * count + j] * (arb(b) - arb(a)) / 2
-                pushes.append(column)
+                    push[i, 0] = gains[i * count + j] * (arb(b) - arb(a)) / 2
+                pushes.append(push)
         return AffineLaw(
             slope=arb_mat(entries), noise=arb_mat(noise.tolist()), horizon=float(problem.horizon),
             mean=arb_mat([[x] for x in mean]), starts=starts, covariance=covariance, pushes=tuple(pushes),

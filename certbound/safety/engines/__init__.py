@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from certbound.safety.engines.affine_laws import by_law
 from certbound.safety.engines.barrier import Barrier, barrier_engine
 from certbound.safety.engines.constants import constants_engine
 from certbound.safety.engines.erosion import Erosion, erode
@@ -19,7 +18,6 @@ __all__ = [
     "backward_engine",
     "Barrier",
     "barrier_engine",
-    "by_law",
     "by_logarithms",
     "constants_engine",
     "erode",

@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import wraps
 
-from certbound.errors import EngineError
+from certbound.errors import CertificateError, EngineError
 from certbound.problem.problem import Problem
 from certbound.reach.affine import AffineAnswer, affine_answer
-from certbound.safety.answers import AS_IT_IS, EngineAnswer, Request, is_at_most
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Proof, Request, is_at_most
 from certbound.watch import held_back, limited_to
 
 _TUBES = 2.0  # seconds for the tubes of a model whose law is known exactly
+_STATED = 30.0  # seconds for what a certificate can state instead
 
 Prove = Callable[..., EngineAnswer]
 
@@ -39,7 +41,9 @@ def by_law(prove: Prove) -> Prove:
             tubes = prove(problem, replace(asked, found=lambda _: None))
         if tubes is None or not tubes.applicable:
             return answer
-        return replace(tubes, conclusive=True) if tubes.log10_delta <= law.log10_delta else _joined(problem, answer, tubes)
+        if tubes.log10_delta <= law.log10_delta:
+            return replace(tubes, conclusive=True)
+        return _joined(problem, answer, tubes)
 
     return proved
 
@@ -61,3 +65,26 @@ def _joined(problem: Problem, answer: EngineAnswer, tubes: EngineAnswer) -> Engi
         tubes, log10_delta=answer.log10_delta, by_limit=limits, conclusive=True, reason=answer.reason, method="linear",
         margin=None if short else tubes.margin, certified=True, foresight=True,
     )  # fmt: skip
+
+
+Writer = Callable[..., Proof]
+
+
+def of_laws(write: Writer, prove: Prove) -> Writer:
+    """A writer for answers of the exact law too: it states what the engine without it proves, which may be less."""
+
+    @wraps(write)
+    def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
+        if not isinstance(answer.details, AffineAnswer):
+            return write(problem, answer, attempt)
+        other: EngineAnswer | None = None
+        with limited_to(_STATED), contextlib.suppress(EngineError):
+            other = prove(problem)
+        if other is None or not other.applicable:
+            raise CertificateError(
+                "no certificate states the exact law of a linear model, and the linear response proves nothing in "
+                f"{_STATED:g} s; shorten the horizon."
+            )
+        return write(problem, other, attempt)
+
+    return written

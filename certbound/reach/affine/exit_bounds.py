@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from flint import ctx
 
 from certbound.display import log10_text
-from certbound.gaussian.affine.below import bound_exits_below
-from certbound.gaussian.affine.trace import Inaccurate
-from certbound.gaussian.affine.upper import bound_exits
+from certbound.gaussian.affine import Inaccurate, bound_exits, bound_exits_below
 from certbound.problem.problem import Problem
 from certbound.reach.affine.reading import AffineModel, affine_model
 
@@ -40,7 +38,9 @@ class AffineAnswer:
 
 
 def affine_answer(problem: Problem, *, plainly: bool = False) -> AffineAnswer | None:
-    """The answer, ``plainly`` the sum over limits; None where the model is not affine, its noise not additive, or its limits are no fixed half-spaces.
+    """The answer, ``plainly`` the sum over limits.
+
+    None where the model is not affine, its noise not additive, or its limits are no fixed half-spaces.
 
     Balls take as many bits as keep every variance accurate, whatever the stiffness.
     """
