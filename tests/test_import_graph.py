@@ -74,7 +74,7 @@ quadratic.steps
 quadratic
 safety.answers safety.falsification
 safety.engines safety.starts
-safety.first_exits safety.affine_laws
+safety.first_exits safety.laws
 safety.certificates
 safety.portfolio
 safety.certificate

@@ -16,7 +16,6 @@ from certbound.checks import instance
 from certbound.problem.model import compile_numpy
 from certbound.problem.problem import Problem
 from certbound.reach.nominal import initial_cells
-from certbound.safety.affine_laws import by_law, of_laws
 from certbound.safety.answers import EngineAnswer, Proof, Request
 from certbound.safety.certificates import (
     backward_proof,
@@ -42,6 +41,7 @@ from certbound.safety.engines import (
     starts_engine,
     values_engine,
 )
+from certbound.safety.laws import by_law, of_laws
 from certbound.tubes.constants import Constants
 
 

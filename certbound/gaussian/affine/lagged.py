@@ -347,8 +347,7 @@ def choose_marks(
     if LOSS in doubling.sources:
         final = final - doubling.gramian(LOSS, 0)
     if law.covariance is not None:
-        forward = doubling.transition(0)
-        final = final + forward * law.covariance * forward.transpose()
+        final = final + law.covariance
     cov, slope = _plain(final), _plain(law.slope)
     own = np.asarray(row, dtype=float)
     fast = own @ slope

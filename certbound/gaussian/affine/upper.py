@@ -33,7 +33,7 @@ _CERTAIN = 2.5  # logarithm of a number of crossings from which on nothing is sa
 _MOST_STATES, _MOST_SIDES, _WATCHED = 80, 8, 12  # for first crossings: states, limits, and limits that marks watch
 _SHARE = -4.6  # logarithm of a limit's part of the whole, below which all its crossings count
 _LIKELY = -4.5  # logarithm of a probability from which on a product says more than a sum
-_HALVINGS, _PART, _HOPELESS = 12, 0.02, 12.0  # of pieces that cost more than that; what all may cost
+_HALVINGS, _PART, _HOPELESS = 12, 0.02, 5.0  # of pieces that cost more than that; what all may cost
 _PARTED = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
 
 
@@ -63,6 +63,8 @@ class Exit:
         self.peaks: dict[int, Array] = {}  # of smooth rows: the pieces' costs at their highest rates
         self.parts: list[tuple[float, Array, Integers]] = []  # of every limit: at its start, piece by piece, which
         self._refine()
+        if not self.smooth:
+            self.parts, _ = self._evaluate(closely=True)
 
     def _chosen(self, limit: Limit) -> Integers:
         """Pieces that meet the limit's window."""
@@ -73,7 +75,7 @@ class Exit:
         slip = 1e-12 * self.law.horizon
         return np.flatnonzero((times[1:] >= first - slip) & (times[:-1] <= last + slip))
 
-    def _evaluate(self) -> tuple[list[tuple[float, Array, Integers]], Array]:
+    def _evaluate(self, *, closely: bool = False) -> tuple[list[tuple[float, Array, Integers]], Array]:
         """What every limit costs, and which pieces are worth being halved (a weight each)."""
         trace = self.trace
         found: list[tuple[float, Array, Integers]] = []
@@ -87,7 +89,7 @@ class Exit:
             else:
                 if self.decays is None:
                     self.decays = Decays(trace, lags_of(trace, self.law.horizon))
-                first, pieces = rough_parts(trace, self.decays, lines, chosen)
+                first, pieces = rough_parts(trace, self.decays, lines, chosen, closely=closely)
                 about = np.where(self._loose(lines)[chosen], -np.inf, pieces)
             found.append((float(first[0]), pieces, chosen))
             logs.append((pieces, about, chosen))
@@ -146,7 +148,7 @@ class Exit:
         sides = {limit.sign: limit for limit in self.limits}
         if len(self.limits) != 2 or len(sides) != 2 or any(limit.during is not None for limit in self.limits):
             return None
-        best = -np.inf
+        best, split = -np.inf, False
         for _ in range(_HALVINGS):
             costs = self._two_sided()
             worst = np.flatnonzero(costs[0] > _PART)
@@ -154,10 +156,14 @@ class Exit:
             if not len(worst) or len(self.trace) > _MOST or np.sum(costs[0]) > _HOPELESS:
                 break
             self.trace.split(worst)
-            self.parts, _ = self._evaluate()
+            split = True
+        if not self.smooth:
+            best = max(best, self._product(*self._two_sided(closely=True)))
+        if split:
+            self.parts, _ = self._evaluate(closely=True)
         return best if best > -np.inf else None
 
-    def _two_sided(self) -> tuple[Array, Array]:
+    def _two_sided(self, *, closely: bool = False) -> tuple[Array, Array]:
         """What leaving |a Z| <= z costs on each piece, and at its start, z the smaller room of both sides."""
         trace, every = self.trace, np.arange(len(self.trace))
         lines = np.minimum(*(trace.rooms(limit.bound, limit.sign)[0] for limit in self.limits))
@@ -165,7 +171,7 @@ class Exit:
             first, pieces, _, _ = smooth_parts(trace, lines, every)
         else:
             assert self.decays is not None
-            first, pieces = rough_parts(trace, self.decays, lines, every)
+            first, pieces = rough_parts(trace, self.decays, lines, every, closely=closely)
         heads = np.exp(log_tail(np.where(lines[:, 0] >= 0, lines[:, 0] / root_up(trace.spread_of()[1]), -np.inf)))
         heads[0] = np.exp(min(float(first[0]), 0.0))
         return 2 * np.exp(np.minimum(pieces, 5.0)) * (1 + 1e-11), 2 * heads * (1 + 1e-11)
