@@ -77,13 +77,17 @@ def of_laws(write: Writer, prove: Prove) -> Writer:
     def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
         if not isinstance(answer.details, AffineAnswer):
             return write(problem, answer, attempt)
-        other: EngineAnswer | None = None
-        with limited_to(_STATED), contextlib.suppress(EngineError):
-            other = prove(problem)
+        other, why = None, f"it proves nothing in {_STATED:g} s"
+        try:
+            with limited_to(_STATED):
+                other = prove(problem)
+                why = other.reason
+        except EngineError as error:
+            why = str(error)
         if other is None or not other.applicable:
             raise CertificateError(
-                "no certificate states the exact law of a linear model, and the linear response proves nothing in "
-                f"{_STATED:g} s; shorten the horizon."
+                "no certificate states the exact law of a linear model, and the linear response does not serve it: "
+                f"{why.rstrip('.')}."
             )
         return write(problem, other, attempt)
 
