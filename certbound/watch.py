@@ -222,6 +222,15 @@ class Watch:
         finally:
             self._alarm = before
 
+    @contextlib.contextmanager
+    def held_back(self) -> Iterator[None]:
+        """Put the interruption of the work at hand off until the block is over."""
+        alarm, self._alarm = self._alarm, None
+        try:
+            yield
+        finally:
+            self._alarm = self._alarm or alarm
+
     def remind(self, seconds: float, call: Callable[[], object]) -> None:
         """Interrupt the work at hand once, at a `poll` after so many seconds; what was to interrupt it does not."""
         self._alarm = (self._clock() + seconds, call)
@@ -304,6 +313,14 @@ def executor_lent() -> Any:
     """Whose executor works on parts of a proof, if any."""
     watch = _CURRENT.get()
     return None if watch is None else watch.executor
+
+
+@contextlib.contextmanager
+def held_back() -> Iterator[None]:
+    """Put off what `Watch.after` would interrupt the block for: it comes at the next `poll` after it."""
+    watch = _CURRENT.get()
+    with contextlib.nullcontext() if watch is None else watch.held_back():
+        yield
 
 
 @contextlib.contextmanager

@@ -41,7 +41,7 @@ problem problem.library
 problem.foreign
 problem.export problem.files
 gaussian.scalar
-gaussian.response
+gaussian.response gaussian.affine
 gaussian
 tubes.constants tubes.line_search
 tubes.tube tubes.schedule tubes.excess
@@ -63,6 +63,7 @@ constants.programs
 constants
 reach.nominal
 reach.sets reach.remainder
+reach.affine
 reach.contraction reach.linear reach.sampled
 reach.below
 reach.starts
@@ -73,7 +74,7 @@ quadratic.steps
 quadratic
 safety.answers safety.falsification
 safety.engines safety.starts
-safety.first_exits
+safety.first_exits safety.laws
 safety.certificates
 safety.portfolio
 safety.certificate
@@ -130,7 +131,7 @@ MANY_DOORS = {
     "checker.endless": (7, "a proof from above and one from below of each kind, which the table of engines names"),
     "values.continuous": (16, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
-    "gaussian.scalar": (17, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
+    "gaussian.scalar": (20, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (41, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (21, "events in both times, for noise that depends on the state and not; units; jumps"),
     "reach.linear": (19, "certificates state the records of the search: linearisations, shares; bounds from below"),

@@ -41,6 +41,7 @@ from certbound.safety.engines import (
     starts_engine,
     values_engine,
 )
+from certbound.safety.laws import by_law, of_laws
 from certbound.tubes.constants import Constants
 
 
@@ -129,6 +130,9 @@ def _grids(problem: Problem) -> float:
     return 1.0 if problem.system.time == "continuous" and problem.system.dimension in (2, 3) else math.inf
 
 
+_LINEAR = by_logarithms(in_coordinates(linear_engine), again=True)
+
+
 ENGINES: dict[str, Engine] = {
     row.name: row
     for row in (
@@ -146,8 +150,8 @@ ENGINES: dict[str, Engine] = {
             words="the exact Gaussian response of the linearised model with a rigorous remainder (Thm K7)",
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states; has lower bounds too, so that it answers UNSAFE",
-            prove=by_logarithms(in_coordinates(linear_engine), again=True),
-            write=of_coordinates(response_proof),
+            prove=by_law(_LINEAR),
+            write=of_laws(of_coordinates(response_proof), _LINEAR),
             again=True,
             chance=linear_chance,
             below=linear_below,

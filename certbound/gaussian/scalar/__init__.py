@@ -11,11 +11,19 @@ directions), `node_clock` with `clock_crossing` (rough directions).
 
 from __future__ import annotations
 
-from certbound.gaussian.scalar.normal import EPS, log_below_above, log_between, log_tail, log_tail_below
+from certbound.gaussian.scalar.normal import (
+    EPS,
+    LOG_ROOT_2PI,
+    lift,
+    log_below_above,
+    log_between,
+    log_tail,
+    log_tail_below,
+)
 from certbound.gaussian.scalar.ornstein_uhlenbeck import log_line_crossing, log_polygon_crossing
 from certbound.gaussian.scalar.pairs import Bounds, log_pair, total, union
 from certbound.gaussian.scalar.rectangles import log_rectangle
-from certbound.gaussian.scalar.rice import crossing_rate
+from certbound.gaussian.scalar.rice import crossing_rate, log_crossings
 from certbound.gaussian.scalar.slepian import Clock, clock_crossing, node_clock
 from certbound.gaussian.scalar.triples import triple_below
 
@@ -25,12 +33,15 @@ __all__ = [
     "clock_crossing",
     "crossing_rate",
     "EPS",
+    "lift",
     "log_below_above",
     "log_between",
+    "log_crossings",
     "log_line_crossing",
     "log_pair",
     "log_polygon_crossing",
     "log_rectangle",
+    "LOG_ROOT_2PI",
     "log_tail",
     "log_tail_below",
     "node_clock",

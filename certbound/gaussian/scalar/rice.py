@@ -60,6 +60,16 @@ def crossing_rate(
     >>> bool(0 <= value - exact < 1e-12)
     True
     """
+    parts = log_crossings(durations, levels, variance, covariance, velocity_variance, start_variance=start_variance)
+    return total(lift(np.concatenate(parts, axis=-1), 64), axis=-1)
+
+
+@quiet
+def log_crossings(
+    durations: ArrayLike, levels: ArrayLike, variance: Bounds, covariance: Bounds, velocity_variance: Bounds, *,
+    start_variance: Bounds | None = None,
+) -> tuple[Array, Array, Array]:
+    """The parts of `crossing_rate`, as natural logarithms: at the start (..., 1), of each piece (..., K), of jumps."""
     h = np.atleast_1d(np.asarray(durations, dtype=np.float64))
     if h.ndim != 1 or not np.all((h > 0) & (h < np.inf)):
         raise ValueError("`durations` must be a row of positive numbers.")
@@ -88,8 +98,7 @@ def crossing_rate(
     rates = np.fmin(np.where(np.isnan(near), np.inf, near), far) + np.log(h)
     initial = np.broadcast_to(initial, rates.shape[:-1])[..., None]
     jumps = np.broadcast_to(_log_jumps(left, right, v_lo, v_hi), (*rates.shape[:-1], len(h) - 1))
-    logs = np.concatenate([initial, rates, jumps], axis=-1)
-    return total(lift(logs, 64), axis=-1)
+    return initial, rates, jumps
 
 
 def _log_jumps(left: Array, right: Array, v_lo: Array, v_hi: Array) -> Array:

@@ -10,6 +10,7 @@ from certbound.display import rounded
 from certbound.problem.held import held_loop
 from certbound.problem.jumps_as_plan import in_pieces
 from certbound.problem.problem import Problem
+from certbound.reach.affine import AffineFailing, affine_failing
 from certbound.reach.below import least_failing
 from certbound.reach.linear import DeviationTube, LinearAnswer, depends_on_state, linear_answer
 from certbound.reach.remainder import hidden_jump
@@ -88,6 +89,10 @@ def _held(problem: Problem, asked: Request) -> EngineAnswer:
 
 def linear_below(problem: Problem) -> EngineAnswer | None:
     """A lower bound of the probability of failing, by the linear response of paths that have not failed yet."""
+    exact = affine_failing(problem)
+    single = problem.fixed_start or problem.initial.random
+    if exact is not None and (single or exact.probability > problem.delta):
+        return None if exact.probability < _SAYS * problem.delta else _failing_exactly(problem, exact)
     found = least_failing(problem)
     if found is None or found.probability < _SAYS * problem.delta:
         return None
@@ -99,6 +104,18 @@ def linear_below(problem: Problem) -> EngineAnswer | None:
         f"{place} the noise breaks '{found.label}' by about {when} with a probability of at least "
         f"{rounded(found.probability, up=False, digits=3)}"
     )
+    return EngineAnswer(log10_lower=least - 1e-14 * (1 + abs(least)), method="linear", reason=f"{words}.")
+
+
+def _failing_exactly(problem: Problem, found: AffineFailing) -> EngineAnswer:
+    """The lower bound of a linear model's exact law."""
+    start = ", ".join(rounded(value, up=False, digits=4) for value in found.start)
+    place = f"from what is drawn around ({start})" if problem.initial.random else f"from ({start})"
+    words = (
+        f"{place} the noise breaks '{found.label}' or another limit with a probability of at least "
+        f"{rounded(found.probability, up=False, digits=3)}"
+    )
+    least = math.log10(found.probability)
     return EngineAnswer(log10_lower=least - 1e-14 * (1 + abs(least)), method="linear", reason=f"{words}.")
 
 

@@ -1,0 +1,97 @@
+"""The exit probability of an affine model with additive noise, from its exact law."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from flint import ctx
+
+from certbound.display import log10_text
+from certbound.gaussian.affine import Inaccurate, bound_exits, bound_exits_below
+from certbound.problem.problem import Problem
+from certbound.reach.affine.reading import AffineModel, affine_model
+
+_BITS = (192, 512, 1400, 4000)
+_FEW, _PART = 8, -4.0  # limits that a lower bound counts, and the least logarithm of their part of the likeliest one
+_LEAST = -1e12  # log10 of a probability that is not told apart from 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AffineAnswer:
+    """log10 of bounds of P(some limit is exceeded), and of each limit's own."""
+
+    model: AffineModel
+    log10_delta: float
+    logs: tuple[float, ...]
+
+    @property
+    def by_limit(self) -> dict[tuple[int, int], float]:
+        """log10 of bounds of P(a path leaves through a limit), by the numbers of constraint and limit."""
+        return dict(zip(self.model.places, self.logs))
+
+    @property
+    def reason(self) -> str:
+        """What takes most, in words."""
+        worst = max(range(len(self.logs)), key=self.logs.__getitem__)
+        return f"the exact law of the linear model gives {log10_text(self.logs[worst])} for '{self.model.names[worst]}'"
+
+
+def affine_answer(problem: Problem, *, plainly: bool = False) -> AffineAnswer | None:
+    """The answer, ``plainly`` the sum over limits.
+
+    None where the model is not affine, its noise not additive, or its limits are no fixed half-spaces.
+
+    Balls take as many bits as keep every variance accurate, whatever the stiffness.
+    """
+    model = affine_model(problem)
+    if model is None:
+        return None
+    for bits in _BITS:
+        with ctx.workprec(bits):
+            try:
+                found = bound_exits(model.law(), model.rows, model.limits, plainly=plainly)
+            except Inaccurate:
+                continue
+        logs = tuple(_log10(log) for log in found.logs)
+        return AffineAnswer(model=model, log10_delta=_log10(found.log_probability), logs=logs)
+    return None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AffineFailing:
+    """P(fail) >= ``probability`` from ``start``; ``label`` names the limit that is likeliest to be exceeded."""
+
+    probability: float
+    start: tuple[float, ...]
+    label: str
+
+
+def affine_failing(problem: Problem) -> AffineFailing | None:
+    """A lower bound from one start: the mean, or the middle of the set, under the disturbances' middle.
+
+    None where `affine_answer` has none, for limits that count in a window of time only, or where nothing is found.
+    """
+    model = affine_model(problem)
+    if model is None or any(limit.during is not None for limit in model.limits):
+        return None
+    for bits in _BITS:
+        with ctx.workprec(bits):
+            try:
+                law = model.law()
+                logs = bound_exits(law, model.rows, model.limits, plainly=True).logs
+                order = sorted(range(len(logs)), key=lambda place: -logs[place])
+                likely = [place for place in order[:_FEW] if logs[place] > logs[order[0]] + _PART]
+                asked = [(model.limits[k].direction, model.limits[k].sign, model.limits[k].bound) for k in likely]
+                start = tuple(float(law.mean[i, 0].mid()) for i in range(problem.system.dimension))
+                found = bound_exits_below(law, model.rows, asked)
+            except Inaccurate:
+                continue
+        return AffineFailing(probability=found, start=start, label=model.names[order[0]]) if found > 0 else None
+    return None
+
+
+def _log10(log: float) -> float:
+    """Rounded up, finite and at most 0."""
+    value = max(log / math.log(10.0), _LEAST)
+    return min(value + 1e-14 * (1 + abs(value)), 0.0)

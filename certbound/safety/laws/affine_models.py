@@ -1,0 +1,94 @@
+"""Affine models with additive noise first by their exact law, then by what has tubes and certificates."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
+
+from certbound.errors import CertificateError, EngineError
+from certbound.problem.problem import Problem
+from certbound.reach.affine import AffineAnswer, affine_answer
+from certbound.safety.answers import AS_IT_IS, EngineAnswer, Proof, Request, is_at_most
+from certbound.watch import held_back, limited_to
+
+_TUBES = 2.0  # seconds for the tubes of a model whose law is known exactly
+_STATED = 30.0  # seconds for what a certificate can state instead
+
+Prove = Callable[..., EngineAnswer]
+
+
+def by_law(prove: Prove) -> Prove:
+    """The engine, after what the exact law of an affine model says; the lesser bound counts.
+
+    The engine has a few seconds then, for its tubes, and for a certificate that states its own bound.
+    """
+
+    def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
+        law = affine_answer(problem, plainly=True) if asked.cells is None else None
+        if law is None:
+            return prove(problem, asked)
+        asked.found(_answer(law))
+        with held_back():
+            law = affine_answer(problem) or law
+        answer = _answer(law)
+        asked.found(answer)
+        if asked.quick:
+            return answer
+        tubes: EngineAnswer | None = None
+        with limited_to(_TUBES), contextlib.suppress(EngineError):
+            tubes = prove(problem, replace(asked, found=lambda _: None))
+        if tubes is None or not tubes.applicable:
+            return answer
+        if tubes.log10_delta <= law.log10_delta:
+            return replace(tubes, conclusive=True)
+        return _joined(problem, answer, tubes)
+
+    return proved
+
+
+def _answer(law: AffineAnswer) -> EngineAnswer:
+    return EngineAnswer(
+        log10_delta=law.log10_delta, method="linear", details=law, foresight=True, conclusive=True,
+        by_limit=law.by_limit, reason=f"{law.reason}.",
+    )  # fmt: skip
+
+
+def _joined(problem: Problem, answer: EngineAnswer, tubes: EngineAnswer) -> EngineAnswer:
+    """The law's bound, with the tubes and the numbers of another answer that proves less."""
+    limits = answer.by_limit
+    if limits is not None and tubes.by_limit is not None:
+        limits = {limit: min(log, tubes.by_limit.get(limit, 0.0)) for limit, log in limits.items()}
+    short = tubes.margin is not None and tubes.margin < 0 and is_at_most(answer.log10_delta, problem.delta)
+    return replace(
+        tubes, log10_delta=answer.log10_delta, by_limit=limits, conclusive=True, reason=answer.reason, method="linear",
+        margin=None if short else tubes.margin, certified=True, foresight=True,
+    )  # fmt: skip
+
+
+Writer = Callable[..., Proof]
+
+
+def of_laws(write: Writer, prove: Prove) -> Writer:
+    """A writer for answers of the exact law too: it states what the engine without it proves, which may be less."""
+
+    @wraps(write)
+    def written(problem: Problem, answer: EngineAnswer, attempt: int = 0) -> Proof:
+        if not isinstance(answer.details, AffineAnswer):
+            return write(problem, answer, attempt)
+        other, why = None, f"it proves nothing in {_STATED:g} s"
+        try:
+            with limited_to(_STATED):
+                other = prove(problem)
+                why = other.reason
+        except EngineError as error:
+            why = str(error)
+        if other is None or not other.applicable:
+            raise CertificateError(
+                "no certificate states the exact law of a linear model, and the linear response does not serve it: "
+                f"{why.rstrip('.')}."
+            )
+        return write(problem, other, attempt)
+
+    return written
