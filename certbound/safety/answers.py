@@ -208,11 +208,10 @@ class Request:
     ``method`` is "auto", or a tube method by name; ``cells`` are parts along each side of the initial set;
     ``constants`` are used instead of certified ones. ``quick``: another engine has proved SAFE or been conclusive, and
     what is slow and then seldom decides may be left out. Not ``thorough``: an engine may spare itself, as it is asked
-    again where that matters, with the ``details`` of its first answer as ``before``. ``bounded``: some probability
-    below 1 is proved, and what has no hope of delta may be left out. ``first``: it may end with the first bound that it
-    finds, and goes on from there when it is asked again. ``effort``: the work that it is asked for, as a multiple of
-    what it does where it is asked alone; its pace is known then, so that it plans for just that. None: as much of 1 as
-    the engine itself takes to fit into the time.
+    again where that matters, with the ``details`` of its first answer as ``before``. ``first``: it may end with the
+    first bound that it finds, and goes on from there when it is asked again. ``effort``: the work that it is asked for,
+    as a multiple of what it does where it is asked alone; its pace is known then, so that it plans for just that. None:
+    as much of 1 as the engine itself takes to fit into the time.
     ``below``: a lower bound is all that is wanted, where that is less work; ``above``: an upper one.
     ``found`` takes an answer that holds already while the engine looks for a better one: it stands where time ends the
     search (`certbound.watch`).
@@ -224,7 +223,6 @@ class Request:
     quick: bool = False
     thorough: bool = True
     first: bool = False
-    bounded: bool = False
     effort: float | None = None
     below: bool = False
     above: bool = False

@@ -323,7 +323,7 @@ class _Search:
         most = _UNLIKELY if self.bounded and not self._likely(name) else math.inf
         most = min(most, _ANYWAY[self.problem.system.dimension <= _FEW]) if self.refuted else most
         with self.watch.share(_EXTRA if self.safe else 1.0, most):
-            self.ask(name, replace(self.request, quick=quick, bounded=self.bounded, before=before and before.details))
+            self.ask(name, replace(self.request, quick=quick, before=before and before.details))
 
     def ask(self, name: str, request: Request) -> None:
         """Keep the best that an engine finds; ``OutOfTime`` where the time ended it."""

@@ -28,7 +28,6 @@ from certbound.values.semilagrangian import bound_exits_by_steps, serves
 from certbound.watch import seconds_left
 
 _SECONDS = 20.0  # about what may be spent
-_SPACE = 120.0  # the same for three states in continuous time
 _GRANT = 0.7  # of the time that is left, where all of it may be spent: what does not come to its end is lost
 _LEAST = 1e-3
 _FLOOR = -300.0
@@ -46,9 +45,8 @@ def values_engine(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
     """
     if asked.quick:
         return EngineAnswer(applicable=False, method="values", reason=SPARED)
-    wide = problem.system.dimension == 3 and not isinstance(problem.system, DiscreteSystem)
-    most = _SPACE if wide else _SECONDS
-    limit = asked.effort * most if asked.effort is not None else most if asked.thorough else _SECONDS / 4
+    most = _SECONDS
+    limit = asked.effort * most if asked.effort is not None else most if asked.thorough else most / 4
     limit = max(limit if asked.effort is not None else min(limit, seconds_left()), _LEAST)
     return replace(_answered(problem, asked, limit), effort=limit / most)
 
@@ -192,9 +190,9 @@ def _confined(problem: Problem, limit: float) -> ExitBounds | None:
 
 
 def _exits(problem: Problem, limit: float, asked: Request) -> ExitBounds:
-    target, spare = problem.reach, asked.bounded and not asked.thorough
+    target = problem.reach
     if target is None:
-        return bound_exits(problem, seconds=limit, delta=problem.delta, spare=spare, above=not asked.below,
+        return bound_exits(problem, seconds=limit, delta=problem.delta, above=not asked.below,
                            below=not asked.above)  # fmt: skip
     first, last = target.during or (0.0, float(problem.horizon))
     if first > 0:

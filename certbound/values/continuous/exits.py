@@ -76,17 +76,16 @@ class ExitBounds:
 
 def bound_exits(
     problem: Problem, *, target: Any = None, seconds: float = 10.0, lower: bool = True, delta: float = 0.0,
-    spare: bool = False, above: bool = True, below: bool = True,
+    above: bool = True, below: bool = True,
 ) -> ExitBounds:
     """Bound P(X_t leaves the safe set for some t <= T) from above and from below by Theorem K8-CT.
 
     Parameters
     ----------
     problem : Problem
-        Continuous time, up to three states; noise of full rank in one and two. In one state any limits, windows,
+        Continuous time, one or two states; noise of full rank. In one state any limits, windows,
         moving sets, obstacles and a random start; in two a bounded safe box, whose sides may move, boxes over windows,
-        or any fixed limits and obstacles over the whole horizon; in three a safe box, which may leave states
-        unbounded, and an upper bound only.
+        or any fixed limits and obstacles over the whole horizon.
     target : region, optional
         In one state, and in two within a fixed box: then the bounds are those of the probability of breaking a
         constraint before the target is entered, or of not entering it by the horizon.
@@ -98,8 +97,6 @@ def bound_exits(
         limits that do not move and hold all the time; elsewhere leaving the domain counts as failing, from above.
     delta : float
         Where the upper bound is at most this, no lower bound is looked for in two states, which takes as long again.
-    spare : bool
-        In three states: stop where a rough guess says that this is out of reach.
     above : bool
         In two states: without it no upper bound is looked for where the lower one does not need it.
     below : bool
@@ -126,7 +123,7 @@ def bound_exits(
     True
     """
     begin = time.perf_counter()
-    _check(problem, target, seconds, most=3)
+    _check(problem, target, seconds)
     model, ended = _model(problem), None
     proposed: Sequence[Proposed] = ()
     earned: Sequence[Proposed] = ()
@@ -148,12 +145,6 @@ def bound_exits(
 
         ended = bound_ended(problem, model, seconds) if problem.ending else None
         upper, least, words, (proposed, earned) = ended or bound_line(problem, model, seconds, lower)
-    elif problem.system.dimension == 3:
-        from certbound.values.continuous.space import three_states
-
-        _refuse_random(problem)
-        hoped = math.log(delta) if spare and delta > 0 else math.inf
-        (upper, words), least = three_states(problem, model, begin + seconds, hoped), None
     elif moving(problem) and all(not c.outside for c in as_stays(problem.constraints)):
         _refuse_random(problem)
         wanted = (math.log(delta) if delta > 0 else -math.inf) if lower else math.inf
@@ -274,7 +265,7 @@ def _refuse_random(problem: Problem) -> None:
         raise InfeasibleError("value functions in several states do not serve a random start; use a set of starts.")
 
 
-def _check(problem: Problem, target: Any, seconds: float, most: int = 2) -> None:
+def _check(problem: Problem, target: Any, seconds: float) -> None:
     if not isinstance(problem, Problem):
         raise TypeError(f"`problem` must be a Problem, got {problem!r}.")
     if not seconds > 0:
@@ -282,13 +273,11 @@ def _check(problem: Problem, target: Any, seconds: float, most: int = 2) -> None
     check_end(problem, "a value function in continuous time")
     if problem.system.time != "continuous":
         raise InfeasibleError("value functions of this kind need continuous time; the problem is discrete.")
-    if problem.system.dimension > most:
-        count = {2: "one or two", 3: "up to three"}[most]
+    if problem.system.dimension > 2:
         raise InfeasibleError(
-            f"value functions in continuous time serve {count} states here, the problem has {problem.system.dimension}."
+            "value functions in continuous time serve one or two states here, the problem has "
+            f"{problem.system.dimension}; `method='backward'` takes three."
         )
-    if target is not None and problem.system.dimension > 2:
-        raise InfeasibleError("value functions in continuous time serve targets in one or two states only.")
     if problem.input_sequence is not None:
         raise InfeasibleError("value functions in continuous time need a feedback law; the plan is an array.")
 

@@ -34,7 +34,6 @@ from certbound.values.continuous.residual import (
     bound_ranges,
     coarse_size,
     sample_in_plane,
-    sample_in_space,
     value_range,
 )  # fmt: skip
 from certbound.values.continuous.surface import Surface
@@ -72,9 +71,8 @@ class Model:
         f, a = self.drift.degrees, self.square.degrees
         if straight:
             return (4 + max(f[0], a[0]), *(6 + max(pair) for pair in zip(f[1:], a[1:])))
-        whole = 3 if n == 3 else 5  # V's degree in each state
-        own = 4 if n == 1 else whole  # degree of V_x in its own variable; that of V_y in x is V's
-        space = [max(whole, f[1 + i] + own, a[1 + i] + 2 * own) + 1 for i in range(n)]
+        own = 4 if n == 1 else 5  # degree of V_x in its own variable; that of V_y in x is V's
+        space = [max(5, f[1 + i] + own, a[1 + i] + 2 * own) + 1 for i in range(n)]
         return (max(3 + f[0], 6 + a[0]) + 1, *space)
 
 
@@ -170,8 +168,8 @@ def sampled_residual(
 
 
 def sampled(surface: Surface, model: Model, *, upper: bool = True, along: int = 5) -> tuple[Array, Array, Array]:
-    """The same in two or three states, with V's least and largest values."""
-    counts, sample = ((4, along, along), sample_in_plane) if len(surface.axes) == 2 else ((4, 7, 7, 7), sample_in_space)
+    """The same, with V's least and largest values."""
+    counts = (4, along, along)
     fixed = interpolants(surface, model, 0, 1, counts) if model.autonomous else None
     per = int(np.prod(surface.cells))
 
@@ -179,7 +177,7 @@ def sampled(surface: Surface, model: Model, *, upper: bool = True, along: int = 
         patches = surface.patches(*ends)
         place = np.arange(len(patches.size)) % (per if fixed else len(patches.size))
         drifts, squares = fixed or interpolants(surface, model, *ends, counts)
-        return sample(patches, drifts, squares, place, counts, upper=upper), *value_range(patches)
+        return sample_in_plane(patches, drifts, squares, place, counts, upper=upper), *value_range(patches)
 
     found = side_by_side(look, list(surface.chunks()))
     excess, low, high = (np.concatenate(parts).reshape(surface.slabs, *surface.cells) for parts in zip(*found))

@@ -1,6 +1,6 @@
 """Ranges of the residual, of V and of |g' grad V|^2 / 2 over cells and slabs.
 
-V is the polynomial of `surface.Surface` on a cell: degree 3 in time, 5 in each state, or 3 in each of three. With a
+V is the polynomial of `surface.Surface` on a cell: degree 3 in time, 5 in each of one or two states. With a
 drift and a squared diffusion that are polynomials up to a remainder (`coefficients`), the residual
 
     R = V_t + f.grad V + tr(a V'') / 2 + Q2,        Q2 = grad V' a grad V / 2,
@@ -15,7 +15,6 @@ are off by `_CHANGE` units of its largest sample times the norms of the matrices
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,6 @@ from certbound.values.continuous.coefficients import Interpolant
 from certbound.values.polynomials import basis_at, lebesgue, nodes_of, norm, to_bernstein, to_parts
 
 SPACE, TIME = 5, 3
-CUBIC = 3  # in each of three states
 _ROUNDOFFS = 500 * UNIT
 _LEFT_OUT = 100 * UNIT
 _CHANGE = 600 * UNIT  # dot products of at most 17 terms along each axis, or of 17^2 where two axes are one product
@@ -41,7 +39,7 @@ class Patches:
 
     Attributes
     ----------
-    coefficients : ndarray, shape (B, 4, 6), (B, 4, 6, 6) or (B, 4, 4, 4, 4)
+    coefficients : ndarray, shape (B, 4, 6) or (B, 4, 6, 6)
     reference, size : ndarray, shape (B,)
         V = reference + polynomial; Z of the module.
     step : ndarray, shape (B,)
@@ -100,7 +98,7 @@ def bound_ranges(
         Where |R| <= ``wanted`` the bound of Q2 may be 0, which saves its evaluation.
     near : float or ndarray, shape (B,)
         How far from the samples of R its bound, the upper or the lower one, may lie before the halves and quarters of
-        a patch are looked at; two or three states.
+        a patch are looked at; two states.
     straight : bool
         Two states: R but for Q2 is bounded closely, and 0 <= Q2 by the sizes of its terms; ``counts`` may be those of
         the rest then.
@@ -111,7 +109,7 @@ def bound_ranges(
     single branches, each of which is a lower bound of the supremum.
     """
     n = len(patches.widths)
-    extremes = _straight if straight else (_on_line, _in_plane, _in_space)[n - 1]
+    extremes = _straight if straight else (_on_line, _in_plane)[n - 1]
     least, most, floor, largest = extremes(patches, drifts, squares, place, counts, wanted, near, upper)
     error, sizes = _errors(patches, squares.size[:, place], n)
     remainders = squares.remainder[:, place]
@@ -219,45 +217,6 @@ def _run_plane(
         np.ascontiguousarray(patches.coefficients), patches.step, width_x, width_y, place,
         np.ascontiguousarray([drift.samples for drift in drifts]), np.ascontiguousarray(squares.samples),
         (*time, *x, *y), changes, wanted, straight, out,
-    )  # fmt: skip
-    return out
-
-
-def _in_space(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], wanted: float, near: Array | float, upper: bool,
-) -> Extremes:
-    """The same in three states; time is not cut."""
-    return _looked_at(_run_space, patches, drifts, squares, place, counts, wanted, near, upper)
-
-
-def sample_in_space(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], *, upper: bool,
-) -> Array:
-    """As `sample_in_plane`."""
-    out = _run_space(patches, drifts, squares, place, counts, 0, np.inf)
-    return np.asarray(out[:, :, 4].max(axis=1) if upper else -out[:, :, 3].max(axis=1))
-
-
-def _run_space(
-    patches: Patches, drifts: Sequence[Interpolant], squares: Interpolant, place: Index,
-    counts: Sequence[int], parts: int, wanted: float,
-) -> Array:
-    """What the kernel finds with this many parts along each state; samples alone for 0."""
-    from certbound.values.continuous.space_kernel import extremes_in_space
-
-    bases = [_derivatives(counts[0], TIME, 2), *(_derivatives(count, CUBIC, 3) for count in counts[1:])]
-    cuts = (min(parts, 1), parts, parts, parts)
-    time, x, y, z = (to_parts(count, k) if k else np.empty((0, count, count)) for count, k in zip(counts, cuts))
-    out = np.empty((len(patches.size), len(drifts), 6))
-    force = np.ascontiguousarray([drift.samples for drift in drifts])
-    square = np.ascontiguousarray(squares.samples)
-    extremes_in_space(
-        np.ascontiguousarray(patches.coefficients).reshape(len(out), 4, 64),
-        1 / np.array([patches.step, *patches.widths]), place, force.reshape(3 * len(force), *force.shape[2:4], -1),
-        square.reshape(*square.shape[:3], -1), bool(square[[1, 2, 5]].any()), tuple(itertools.chain(*bases)),
-        (time, x, y, z), wanted, out,
     )  # fmt: skip
     return out
 

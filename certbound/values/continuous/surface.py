@@ -3,9 +3,7 @@
 V(t, x) is the piecewise polynomial that takes given values, first and second derivatives at the nodes of a grid (degree
 5 in each state), and given values and rates at the ends of slabs of time (degree 3). The data are shared by
 neighbouring cells and slabs, so that V is twice continuously differentiable in x, continuous in t and continuously
-differentiable in t on each slab for *any* finite data: a wrong proposal can only cost tightness. In three states there
-are no second derivatives among the data: V has degree 3 in each state, and is continuously differentiable in x with
-second derivatives that are continuous on each cell, which is enough (docs/values.md).
+differentiable in t on each slab for *any* finite data: a wrong proposal can only cost tightness.
 """
 
 from __future__ import annotations
@@ -22,12 +20,10 @@ from certbound.values.continuous.residual import Patches, along, value_range
 from certbound.values.polynomials import CUBIC_HERMITE, HERMITE, QUARTERS
 from certbound.watch import poll
 
-_MANY = 4000  # cells that are looked at together in three states
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Surface:
-    """Hermite data of V over a grid; up to three states.
+    """Hermite data of V over a grid; one or two states.
 
     Attributes
     ----------
@@ -35,9 +31,9 @@ class Surface:
         Rising nodes of each state, N_i + 1 of them.
     times : ndarray, shape (K + 1,)
         Rising ends of the slabs.
-    values : ndarray, shape (K + 1, N_1 + 1, 3[, N_2 + 1, 3]) or (K + 1, N_1 + 1, 2, N_2 + 1, 2, N_3 + 1, 2)
+    values : ndarray, shape (K + 1, N_1 + 1, 3[, N_2 + 1, 3])
         V and its derivatives by order in each state, at the ends of the slabs.
-    start_rates, end_rates : ndarray, shape (K, N_1 + 1, 3[, N_2 + 1, 3]) or (K, N_1 + 1, 2, N_2 + 1, 2, N_3 + 1, 2)
+    start_rates, end_rates : ndarray, shape (K, N_1 + 1, 3[, N_2 + 1, 3])
         Time derivatives of the same at the start and at the end of each slab.
 
     Raises
@@ -149,12 +145,6 @@ class Surface:
                  self.values[first + 1 : last + 1], self.end_rates[first:last]]  # fmt: skip
         return self._patches(np.stack(parts, axis=1), self.steps[first:last])
 
-    def rows(self, limit: int = 4000) -> Iterator[tuple[int, Surface]]:
-        """The surface in slices along the first state, each with its first cell; ``limit`` cells, or one row."""
-        stride = max(1, limit // int(np.prod(self.cells[1:])))
-        for first in range(0, self.cells[0], stride):
-            yield first, self._cut(slice(first, first + stride + 1))
-
     def chunks(self, limit: int = 4000) -> Iterator[tuple[int, int]]:
         """Ranges of slabs with at most ``limit`` patches (or one slab)."""
         stride = max(1, limit // int(np.prod(self.cells)))
@@ -164,9 +154,6 @@ class Surface:
 
     def range_at(self, index: int) -> tuple[Array, Array]:
         """Bounds of V over each cell at one end of a slab, shape ``cells``."""
-        if len(self.axes) == 3 and np.prod(self.cells) > _MANY:
-            found = [part.range_at(index) for _, part in self.rows(_MANY)]
-            return np.concatenate([low for low, _ in found]), np.concatenate([high for _, high in found])
         low, high = value_range(self._patches_at(index))
         return low.reshape(self.cells), high.reshape(self.cells)
 
@@ -245,12 +232,11 @@ class Surface:
 
 
 def _patches_of(data: Array, steps: Array, axes: tuple[Array, ...]) -> Patches:
-    """Bernstein coefficients from Hermite data of shape (S, 4, N_1 + 1, d, ...): degree 2 d - 1 in each state."""
+    """Bernstein coefficients from Hermite data of shape (S, 4, N_1 + 1, 3, ...): degree 5 in each state."""
     n, slabs = len(axes), len(steps)
-    if n == 2 and data.shape[3] == 3:
+    if n == 2:
         return _patches_in_plane(data, steps, axes)
-    orders = data.shape[3] if n else 3
-    hermite = HERMITE if orders == 3 else CUBIC_HERMITE
+    orders = 3
     cells = tuple(len(axis) - 1 for axis in axes)
     data = data.copy()
     for axis in range(n):  # (S, 4, ..., N + 1, d, ...) to (S, 4, ..., N, 2 d, ...)
@@ -270,12 +256,12 @@ def _patches_of(data: Array, steps: Array, axes: tuple[Array, ...]) -> Patches:
     data[values] -= reference.reshape(-1, *([1] * (n + 1)))
     data[:, 1::2] *= step.reshape(-1, *([1] * (n + 1)))
     for axis, width in enumerate(widths):
-        powers = np.stack([np.ones_like(width), width, width * width][:orders] * 2, axis=1)
+        powers = np.stack([np.ones_like(width), width, width * width] * 2, axis=1)
         data *= powers.reshape(-1, *([1] * (axis + 1)), 2 * orders, *([1] * (n - 1 - axis)))
     coefficients, magnitude = along(CUBIC_HERMITE, data, 1), along(np.abs(CUBIC_HERMITE), np.abs(data), 1)
     for axis in range(n):
-        coefficients = along(hermite, coefficients, 2 + axis)
-        magnitude = along(np.abs(hermite), magnitude, 2 + axis)
+        coefficients = along(HERMITE, coefficients, 2 + axis)
+        magnitude = along(np.abs(HERMITE), magnitude, 2 + axis)
     size = magnitude.reshape(len(step), -1).max(axis=1)
     return Patches(coefficients=coefficients, reference=reference, size=size, step=step, widths=widths)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -68,6 +69,12 @@ def difference(nodes: Array, stencils: Stencils, order: int) -> sp.csr_array:
 
     Where none fits the last one is moved inward.
     """
+    return _difference(np.asarray(nodes, dtype=float).tobytes(), tuple(stencils), order)
+
+
+@lru_cache(maxsize=64)
+def _difference(line: bytes, stencils: tuple[tuple[int, int], ...], order: int) -> sp.csr_array:
+    nodes = np.frombuffer(line)
     count = len(nodes)
     rows: list[int] = []
     columns: list[int] = []
