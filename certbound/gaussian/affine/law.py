@@ -66,6 +66,11 @@ class AffineLaw:
         """Whether the mean is 0 at all times."""
         return all(self.mean[i, 0].is_zero() for i in range(self.dimension))
 
+    @property
+    def resting(self) -> bool:
+        """Whether all but the noise stays at 0."""
+        return self.still and self.starts is None and not self.pushes
+
     @cached_property
     def parts(self) -> tuple[arb_mat, arb_mat | None]:
         """M+ and M- (None: 0)."""
