@@ -80,6 +80,19 @@ def lags_of(trace: Trace, longest: float) -> Lags:
     return Lags(times=np.array(times), rows=matrix, moved=moved, bends=root_up(floats(squares)[1][:-1]))
 
 
+def _largest_rate(lost: Array, moved: Array, least: Array, most: Array) -> Array:
+    """The largest (lost + moved r)/(least + r^2) for r in [0, most], what V changes by along the row being r^2 at most.
+
+    With s^2 = s_k^2 + r^2 - 2 (what V- adds) at the time of it, -w_s/s_s^2 is at most that.
+    """
+    at = moved * least / (lost + np.sqrt(lost**2 + moved**2 * np.maximum(least, 0.0)))
+    at = np.where(np.isfinite(at), np.minimum(at, most), 0.0)
+    found = (lost + moved * at) / (least + at**2)
+    inside = at < most  # at a maximum the function is flat: a rounding of its place costs nothing
+    found = np.where(inside, found * (1 + 1e-12), (lost + moved * most) / (least + most**2) * (1 + 1e-12))
+    return np.where((least > 0) & np.isfinite(found), found, np.where(least > 0, lost / least, np.inf))
+
+
 def _plain(matrix: arb_mat) -> tuple[Array, Array]:
     """Middle and radius in floats."""
     low, high = floats(matrix.entries())
@@ -137,10 +150,14 @@ class Decays:
         gap = np.diff(lags.times)
         fall = -w[0].T  # (P, J + 1), of g
         bend = root_up(high) * lags.bends * gap**2 / 8 * (1 + 1e-12)
-        extra = bend + changed * (np.maximum(norms[:, :-1], norms[:, 1:]) + lags.bends * gap**2 / 8)
+        moved = np.maximum(norms[:, :-1], norms[:, 1:]) + lags.bends * gap**2 / 8
+        extra = bend + changed * moved
         first, last = fall[:, :-1], fall[:, 1:]
-        lost = np.where(np.arange(len(gap)) == 0, np.maximum(first, last), 0.5 * (first + last)) + extra
-        bound = 1 - np.maximum(np.cumsum(lost * gap, axis=1), 0.0) / low * (1 + 1e-12)
+        lost = np.where(np.arange(len(gap)) == 0, np.maximum(first, last), 0.5 * (first + last)) + bend
+        columns = trace.columns
+        least = np.array([[trace.s[0][k] - 2 * np.sum(columns["loss s"][k:last])] for k, last in spans]) * (1 - 1e-14)
+        rate = _largest_rate(np.maximum(lost, 0.0), moved, least, changed)
+        bound = 1 - np.cumsum(rate * gap, axis=1) * (1 + 1e-12)
         below = gap * (np.abs(last - first) / 8 + extra) / low * (1 + 1e-12) + 1e-13
         bound = np.pad(bound, ((0, 0), (1, 0)), constant_values=1.0)
         result = np.stack([bound, np.pad(below, ((0, 0), (0, 1)))], axis=1)
