@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from flint import arb_mat
 
-from certbound.arrays import Array, Integers
+from certbound.arrays import Array, Integers, Mask
 from certbound.gaussian.affine.law import floats, root_up
 from certbound.gaussian.affine.trace import Trace, dot, rows_of
 from certbound.gaussian.scalar import (
@@ -36,7 +36,7 @@ _SHORT, _FIRST = 0.005, 0.01  # of the initial decay, what the first cell may le
 _SHARES = (0.0, 0.4, 0.7, 0.85, 0.93, 0.97)  # of a variance that may stand still over a block
 _CLOCKS = np.array([0.02 * 1.25**k for k in range(25)])  # of blocks, up to 4.2
 _LEVELS = np.concatenate([np.arange(-4.0, 0.0, 0.25), np.arange(0.0, 12.01, 0.06)])  # in deviations, of the table
-_SHORTER, _JOINED = 0.7, 2.0  # clocks of pieces that are joined to one block, and of the block
+_SHORTER, _JOINED = 0.8, (0.8, 1.7, 3.5)  # clocks of pieces that are joined to one block, and of the block
 _WEIGHT = 2.0  # clock of a window times the square of the level, as in `clock_crossing`
 _MOST = 64  # windows of a block
 
@@ -221,22 +221,44 @@ def joined_parts(trace: Trace, decays: Decays, lines: Array, chosen: Integers, p
     grown = 0.5 * trace.columns["gain s"][chosen] / low * (1 + 1e-12)
     h, times = trace.steps[chosen], decays.lags.times
     about = decays.own / (2 * low) * h  # clocks of the pieces
-    runs, start, total = [], 0, np.inf
-    for k in range(len(chosen) + 1):
-        fits = k < len(chosen) and about[k] <= _SHORTER and np.isfinite(pieces[k]) and level[k] >= 0
-        if fits and total + about[k] <= _JOINED:
-            total += about[k]
+    fits = (about <= _SHORTER) & np.isfinite(pieces) & (level >= 0)
+    best = pieces
+    for most in _JOINED:
+        runs = _runs(about, fits, most)
+        if runs:
+            known = decays.over([(int(chosen[first]), int(chosen[last - 1]) + 1) for first, last in runs])
+            speeds = _speeds(0.0, known[:, 0], known[:, 1], times[1:])
+            found = _by_runs(runs, speeds, times[1:], h, level, grown, pieces, unknown=bool(low[0] <= 0))
+            if np.logaddexp.reduce(found) < np.logaddexp.reduce(best):
+                best = found
+    return best
+
+
+def _runs(about: Array, fits: Mask, most: float) -> list[tuple[int, int]]:
+    """Pieces that follow each other, from the last ones on, with clocks of about ``most`` together."""
+    runs, end, total = [], len(about), 0.0
+    for k in range(len(about) - 1, -2, -1):
+        if k >= 0 and fits[k] and total + about[k] <= most:
+            total += float(about[k])
             continue
-        if k - start > 1 and np.isfinite(total):
-            runs.append((start, k))
-        start, total = k, float(about[k]) if fits else np.inf
-    if not runs:
-        return pieces
-    known = decays.over([(int(chosen[first]), int(chosen[last - 1]) + 1) for first, last in runs])
+        if end - (k + 1) > 1:
+            runs.append((k + 1, end))
+        opens = k >= 0 and fits[k] and about[k] <= most
+        end, total = (k + 1, float(about[k])) if opens else (k, 0.0)
+    return runs[::-1]
+
+
+def _by_runs(
+    runs: list[tuple[int, int]], speeds: Array, ends: Array, h: Array, level: Array, grown: Array, pieces: Array, *,
+    unknown: bool,
+) -> Array:
+    """The costs with each run as one block, where that is less.
+
+    ``unknown``: nothing is said of the end of the very first piece.
+    """
     result = pieces.copy()
-    speeds = _speeds(0.0, known[:, 0], known[:, 1], times[1:])
     for (first, last), speed in zip(runs, speeds):
-        reach = int(np.searchsorted(times[1:], np.sum(h[first:last]) * (1 + 1e-12)))
+        reach = int(np.searchsorted(ends, np.sum(h[first:last]) * (1 + 1e-12)))
         if reach >= len(speed) or not np.isfinite(speed[reach]):
             continue
         clocks = (speed[reach] * h[first:last] + grown[first:last]) * (1 + 1e-12)
@@ -245,7 +267,9 @@ def joined_parts(trace: Trace, decays: Decays, lines: Array, chosen: Integers, p
         whole = 10.0 ** (clock_crossing(clock, own) * (1 - 1e-15) + 1e-14)
         rest = whole - float(np.exp(log_tail_below(own[:1]))[0]) * (1 - 1e-12)  # but for being above at the start
         cost = float(np.log(max(rest, 0.0) + 1e-300)) + 1e-12
-        if first and own[0] < level[first - 1]:  # the step from the piece before
+        if first == 1 and unknown:
+            cost = float(np.logaddexp(cost, log_tail(own[:1])[0]))
+        elif first and own[0] < level[first - 1]:  # the step from the piece before
             cost = float(np.logaddexp(cost, log_between(own[:1], level[first - 1 : first])[0]))
         if cost < np.logaddexp.reduce(pieces[first:last]):
             result[first:last] = -np.inf
