@@ -18,7 +18,7 @@ from certbound.problem.sets import Box, Faces
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.sets import limit_names
 
-_MOST_STATES = 250
+_MOST_STATES, _MOST_DRIVEN = 250, 80  # and where noise drives a limit's row itself, which takes covariance matrices
 
 BALLS: dict[str, Callable[..., arb]] = {
     "const": arb, "neg": lambda x: -x, "add": lambda x, y: x + y, "sub": lambda x, y: x - y,
@@ -122,6 +122,8 @@ def affine_model(problem: Problem) -> AffineModel | None:
         return None
     limits = _limits(problem)
     if limits is None or not limits[1]:
+        return None
+    if n > _MOST_DRIVEN and any(np.any(np.asarray(row) @ np.asarray(system.diffusion)) for row in limits[0]):
         return None
     box = system.disturbance
     middle = [] if box is None else [(arb(a) + arb(b)) / 2 for a, b in zip(box.low.tolist(), box.high.tolist())]
