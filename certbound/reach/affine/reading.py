@@ -67,7 +67,7 @@ class AffineModel:
             starts = arb_mat(size, len(wide))
             for column, i in enumerate(wide):
                 starts[i, column] = (arb(float(hull.hi[i])) - arb(float(hull.lo[i]))) / 2
-        pushes: list[arb_mat] = []
+        disturbances: list[arb_mat] = []
         if box is not None:
             gains = _values(problem, middle, _by_disturbances(problem))
             count = len(middle)
@@ -75,10 +75,10 @@ class AffineModel:
                 push = arb_mat(size, 1)
                 for i in range(n):
                     push[i, 0] = gains[i * count + j] * (arb(b) - arb(a)) / 2
-                pushes.append(push)
+                disturbances.append(push)
         return AffineLaw(
             slope=arb_mat(entries), noise=arb_mat(noise.tolist()), horizon=float(problem.horizon),
-            mean=arb_mat([[x] for x in mean]), starts=starts, covariance=covariance, pushes=tuple(pushes),
+            mean=arb_mat([[x] for x in mean]), starts=starts, covariance=covariance, disturbances=tuple(disturbances),
         )  # fmt: skip
 
 
