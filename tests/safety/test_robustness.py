@@ -19,6 +19,7 @@ from certbound.constants.metrics import bound_metrics
 from certbound.errors import EnclosureError, EngineError, InfeasibleError, SolverError, contained
 from certbound.reach.linear import linearisation
 from certbound.reach.linear.linearisation import Linearisation
+from certbound.safety.engines import linear_engine
 from certbound.safety.portfolio import ENGINES
 from certbound.safety.verification import verify_safety
 from certbound.watch import OutOfTime
@@ -217,16 +218,17 @@ def test_a_reach_tube_that_grows_beyond_all_bounds_is_no_bad_input() -> None:
 
 
 def test_a_system_too_stiff_for_the_linear_engine_says_so() -> None:
-    verdict = verify_safety(stiff(), method="linear")
-    assert verdict.status == "UNKNOWN"
-    assert "too stiff for the linear engine: ||J|| h = 50" in verdict.reason
+    with pytest.raises(EngineError, match=r"too stiff for the linear engine: \|\|J\|\| h = 50"):
+        linear_engine(stiff())
+    verdict = verify_safety(stiff(), method="linear")  # the exact law does not mind
+    assert verdict.status == "SAFE"
 
 
 def test_an_exact_engine_that_found_no_bound_keeps_no_other_from_being_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linearisation, "MOST_PIECES", 200)  # too few for this rate
     system = cb.ContinuousSystem(lambda x: -1000 * x, states=1, diffusion=[[1.0]])
     problem = cb.Problem(system, initial=[0], safe=[cb.Inside(cb.Box([-0.5], [0.5]))], horizon=0.5)
-    answer = verify_safety(problem, method="linear").answers["linear"]
+    answer = linear_engine(problem)
     assert answer.margin is None
     assert not answer.conclusive
     assert "no bound of the deviation was found" in answer.reason

@@ -25,7 +25,7 @@ from certbound.rigor.rounding import quiet
 from certbound.watch import poll
 
 _STEPS = (32, 128)  # of a short horizon
-_MANY = 3  # rows from which on the coarser ones serve
+_MANY, _LARGE = 3, 60  # rows and states beyond which the coarser ones serve
 _LONG = 60.0  # mean periods from which on a horizon is long
 _PERIODS = (0.08, 0.15, 0.3)  # parts of a mean period between events of a long horizon
 _LATE = 12  # halvings of the horizon, after one of which the law hardly changes
@@ -50,7 +50,7 @@ def bound_exits_below(law: AffineLaw, rows: Sequence[Sequence[float]], asked: Se
     best = 0.0
     shortest = min(periods)
     if law.horizon <= _LONG * shortest or not law.still:
-        for steps in _STEPS[: 1 if len(own) > _MANY else None]:
+        for steps in _STEPS[: 1 if len(own) > _MANY or law.dimension > _LARGE else None]:
             poll("events at single times")
             best = max(best, _short(law, own, events, steps))
     late = _late(law, own)

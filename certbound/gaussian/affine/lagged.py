@@ -386,8 +386,8 @@ def choose_marks(
         if score[lag, number] < _GAIN:
             break
         chosen.append((lag, number))
-        apart = np.abs(lag - lags)
-        later = np.where((lags <= lag)[:, None], ahead[apart, :, number], ahead[apart, number, :])
+        gap = np.abs(lag - lags)
+        later = np.where((lags <= lag)[:, None], ahead[gap, :, number], ahead[gap, number, :])
         rho = (later - to_x * to_x[lag, number] / s2 - to_e * to_e[lag, number]) / (deviation * deviation[lag, number])
         rho = np.clip(np.nan_to_num(rho), -1.0, 1.0)[..., None] * np.ones(len(u))
         both = np.exp(log_below_above(-gaps, np.broadcast_to(gaps[lag, number], gaps.shape), -rho)) @ weight

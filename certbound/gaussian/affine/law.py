@@ -44,7 +44,7 @@ class AffineLaw:
         Generators of a zonotope of starts about it, (n, g).
     covariance : arb_mat or None
         V_0 of a random start.
-    pushes : sequence of arb_mat
+    disturbances : sequence of arb_mat
         E_j times the disturbance's radius, each (n, 1): it may take any values in [-1, 1] of that.
     """
 
@@ -54,7 +54,7 @@ class AffineLaw:
     mean: arb_mat
     starts: arb_mat | None = None
     covariance: arb_mat | None = None
-    pushes: tuple[arb_mat, ...] = ()
+    disturbances: tuple[arb_mat, ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -65,6 +65,11 @@ class AffineLaw:
     def still(self) -> bool:
         """Whether the mean is 0 at all times."""
         return all(self.mean[i, 0].is_zero() for i in range(self.dimension))
+
+    @property
+    def resting(self) -> bool:
+        """Whether all but the noise stays at 0."""
+        return self.still and self.starts is None and not self.disturbances
 
     @cached_property
     def parts(self) -> tuple[arb_mat, arb_mat | None]:
@@ -97,7 +102,7 @@ class AffineLaw:
             sources[MEAN] = transposed_square(self.mean)
         if self.starts is not None:
             sources[WIDE] = transposed_square(self.starts)
-        for place, push in enumerate(self.pushes):
+        for place, push in enumerate(self.disturbances):
             sources[f"push{place}"] = transposed_square(push)
         return Doubling(self.slope, sources, self.horizon)
 

@@ -16,10 +16,19 @@ from functools import lru_cache
 import numpy as np
 from flint import arb_mat
 
-from certbound.arrays import Array, Integers
+from certbound.arrays import Array, Integers, Mask
 from certbound.gaussian.affine.law import floats, root_up
 from certbound.gaussian.affine.trace import Trace, dot, rows_of
-from certbound.gaussian.scalar import lift, log_between, log_line_crossing, log_polygon_crossing, log_tail
+from certbound.gaussian.scalar import (
+    Clock,
+    clock_crossing,
+    lift,
+    log_between,
+    log_line_crossing,
+    log_polygon_crossing,
+    log_tail,
+    log_tail_below,
+)
 from certbound.rigor.rounding import quiet
 
 _PARTS = 8  # cells of lags between two doublings
@@ -27,6 +36,7 @@ _SHORT, _FIRST = 0.005, 0.01  # of the initial decay, what the first cell may le
 _SHARES = (0.0, 0.4, 0.7, 0.85, 0.93, 0.97)  # of a variance that may stand still over a block
 _CLOCKS = np.array([0.02 * 1.25**k for k in range(25)])  # of blocks, up to 4.2
 _LEVELS = np.concatenate([np.arange(-4.0, 0.0, 0.25), np.arange(0.0, 12.01, 0.06)])  # in deviations, of the table
+_SHORTER, _JOINED = 0.8, (0.8, 1.7, 3.5)  # clocks of pieces that are joined to one block, and of the block
 _WEIGHT = 2.0  # clock of a window times the square of the level, as in `clock_crossing`
 _MOST = 64  # windows of a block
 
@@ -70,6 +80,19 @@ def lags_of(trace: Trace, longest: float) -> Lags:
     return Lags(times=np.array(times), rows=matrix, moved=moved, bends=root_up(floats(squares)[1][:-1]))
 
 
+def _largest_rate(lost: Array, moved: Array, least: Array, most: Array) -> Array:
+    """The largest (lost + moved r)/(least + r^2) for r in [0, most], what V changes by along the row being r^2 at most.
+
+    With s^2 = s_k^2 + r^2 - 2 (what V- adds) at the time of it, -w_s/s_s^2 is at most that.
+    """
+    at = moved * least / (lost + np.sqrt(lost**2 + moved**2 * np.maximum(least, 0.0)))
+    at = np.where(np.isfinite(at), np.minimum(at, most), 0.0)
+    found = (lost + moved * at) / (least + at**2)
+    inside = at < most  # at a maximum the function is flat: a rounding of its place costs nothing
+    found = np.where(inside, found * (1 + 1e-12), (lost + moved * most) / (least + most**2) * (1 + 1e-12))
+    return np.where((least > 0) & np.isfinite(found), found, np.where(least > 0, lost / least, np.inf))
+
+
 def _plain(matrix: arb_mat) -> tuple[Array, Array]:
     """Middle and radius in floats."""
     low, high = floats(matrix.entries())
@@ -88,6 +111,8 @@ class Decays:
     def __post_init__(self) -> None:
         self._known: dict[tuple[int, int], Array] = {}
         self._moved = _plain(self.lags.moved)
+        noise, row = self.trace.law.noise, arb_mat([self.trace.row])
+        self.own = float(floats((row * (noise * noise.transpose()) * row.transpose()).entries())[1][0])
 
     def of(self, places: Integers) -> Array:
         """(P, 2, J + 1): a lower bound of g/s^2 at every lag, and how far below its chord it may be until the next one.
@@ -98,46 +123,54 @@ class Decays:
         keys = [(int(trace.levels[k]), trace.indices[k]) for k in places.tolist()]
         new = [(key, k) for key, k in zip(keys, places.tolist()) if key not in self._known]
         if new:
-            for (key, _), values in zip(new, self._found([k for _, k in new])):
+            for (key, _), values in zip(new, self.over([(k, k + 1) for _, k in new])):
                 self._known[key] = values
         return np.array([self._known[key] for key in keys])
 
     @quiet
-    def _found(self, places: list[int]) -> Array:
+    def over(self, spans: list[tuple[int, int]]) -> Array:
+        """The same over runs of pieces, from a first one to the one before a last."""
         trace, lags = self.trace, self.lags
         law = trace.law
         own = arb_mat([trace.row]).transpose()
         start = None if law.covariance is None else law.covariance * own
         vectors = []
-        for k in places:
+        for k, _ in spans:
             gain, loss = trace.matrices[k]
             vector = gain * own - loss * own
             vectors.append(vector if start is None else vector + start)
         joined = arb_mat([[v[i, 0] for v in vectors] for i in range(law.dimension)])
         count = lags.rows.nrows()
         w = np.array(floats((lags.moved * joined).entries())).reshape(2, count, -1)
-        norms = np.array([self._norms(k) for k in places])  # (P, J + 1)
-        low, high = (end[places][:, None] for end in trace.spread_of())
-        changed = root_up(np.array([self._change(k) for k in places]))[:, None]  # sd of what V changes by along the row
+        norms = np.array([self._norms(*span) for span in spans])  # (P, J + 1)
+        spread = trace.spread_of()
+        low = np.array([[np.min(spread[0][first:last])] for first, last in spans])
+        high = np.array([[np.max(spread[1][first:last])] for first, last in spans])
+        changed = root_up(np.array([[self._change(*span)] for span in spans]))  # sd of what V changes by along the row
         gap = np.diff(lags.times)
         fall = -w[0].T  # (P, J + 1), of g
         bend = root_up(high) * lags.bends * gap**2 / 8 * (1 + 1e-12)
-        extra = bend + changed * (np.maximum(norms[:, :-1], norms[:, 1:]) + lags.bends * gap**2 / 8)
+        moved = np.maximum(norms[:, :-1], norms[:, 1:]) + lags.bends * gap**2 / 8
+        extra = bend + changed * moved
         first, last = fall[:, :-1], fall[:, 1:]
-        lost = np.where(np.arange(len(gap)) == 0, np.maximum(first, last), 0.5 * (first + last)) + extra
-        bound = 1 - np.maximum(np.cumsum(lost * gap, axis=1), 0.0) / low * (1 + 1e-12)
+        lost = np.where(np.arange(len(gap)) == 0, np.maximum(first, last), 0.5 * (first + last)) + bend
+        columns = trace.columns
+        least = np.array([[trace.s[0][k] - 2 * np.sum(columns["loss s"][k:last])] for k, last in spans]) * (1 - 1e-14)
+        rate = _largest_rate(np.maximum(lost, 0.0), moved, least, changed)
+        bound = 1 - np.cumsum(rate * gap, axis=1) * (1 + 1e-12)
         below = gap * (np.abs(last - first) / 8 + extra) / low * (1 + 1e-12) + 1e-13
         bound = np.pad(bound, ((0, 0), (1, 0)), constant_values=1.0)
         result = np.stack([bound, np.pad(below, ((0, 0), (0, 1)))], axis=1)
         return np.where(np.isnan(result) | (low[:, None] <= 0), -np.inf, result)
 
-    def _change(self, k: int) -> float:
-        """Bound of a (D+ + D-) a over a piece."""
-        return float(self.trace.columns["gain s"][k] + self.trace.columns["loss s"][k]) * (1 + 1e-15)
+    def _change(self, first: int, last: int) -> float:
+        """Bound of a (D+ + D-) a over a run of pieces."""
+        columns = self.trace.columns
+        return float(np.sum(columns["gain s"][first:last] + columns["loss s"][first:last])) * (1 + 1e-12)
 
-    def _norms(self, k: int) -> Array:
-        """Norms of the moved rows in D+ + D- over a piece, in floats with their rounding."""
-        before, after = self.trace.matrices[k], self.trace.matrices[k + 1]
+    def _norms(self, first: int, last: int) -> Array:
+        """Norms of the moved rows in D+ + D- over a run of pieces, in floats with their rounding."""
+        before, after = self.trace.matrices[first], self.trace.matrices[last]
         middle, radius = _plain(after[0] - before[0] + after[1] - before[1])
         slack = 4e-16 * len(middle)
         rows, error = self._moved
@@ -177,6 +210,73 @@ def rough_parts(
     return first, np.asarray(lift(np.logaddexp(costs, jumps), 16))
 
 
+@quiet
+def joined_parts(trace: Trace, decays: Decays, lines: Array, chosen: Integers, pieces: Array) -> Array:
+    """The costs of `rough_parts` where short pieces that follow each other are one block: all of it at the first.
+
+    Every piece is a window of the block's polygon then, and begins nothing anew.
+    """
+    low, high = (x[chosen] for x in trace.spread_of())
+    level = np.min(lines[chosen], axis=1) / root_up(high) * (1 - 1e-14)
+    grown = 0.5 * trace.columns["gain s"][chosen] / low * (1 + 1e-12)
+    h, times = trace.steps[chosen], decays.lags.times
+    about = decays.own / (2 * low) * h  # clocks of the pieces
+    fits = (about <= _SHORTER) & np.isfinite(pieces) & (level >= 0)
+    best = pieces
+    for most in _JOINED:
+        runs = _runs(about, fits, most)
+        if runs:
+            known = decays.over([(int(chosen[first]), int(chosen[last - 1]) + 1) for first, last in runs])
+            speeds = _speeds(0.0, known[:, 0], known[:, 1], times[1:])
+            found = _by_runs(runs, speeds, times[1:], h, level, grown, pieces, unknown=bool(low[0] <= 0))
+            if np.logaddexp.reduce(found) < np.logaddexp.reduce(best):
+                best = found
+    return best
+
+
+def _runs(about: Array, fits: Mask, most: float) -> list[tuple[int, int]]:
+    """Pieces that follow each other, from the last ones on, with clocks of about ``most`` together."""
+    runs, end, total = [], len(about), 0.0
+    for k in range(len(about) - 1, -2, -1):
+        if k >= 0 and fits[k] and total + about[k] <= most:
+            total += float(about[k])
+            continue
+        if end - (k + 1) > 1:
+            runs.append((k + 1, end))
+        opens = k >= 0 and fits[k] and about[k] <= most
+        end, total = (k + 1, float(about[k])) if opens else (k, 0.0)
+    return runs[::-1]
+
+
+def _by_runs(
+    runs: list[tuple[int, int]], speeds: Array, ends: Array, h: Array, level: Array, grown: Array, pieces: Array, *,
+    unknown: bool,
+) -> Array:
+    """The costs with each run as one block, where that is less.
+
+    ``unknown``: nothing is said of the end of the very first piece.
+    """
+    result = pieces.copy()
+    for (first, last), speed in zip(runs, speeds):
+        reach = int(np.searchsorted(ends, np.sum(h[first:last]) * (1 + 1e-12)))
+        if reach >= len(speed) or not np.isfinite(speed[reach]):
+            continue
+        clocks = (speed[reach] * h[first:last] + grown[first:last]) * (1 + 1e-12)
+        own = level[first:last]
+        clock = Clock(increments=clocks, starts=np.zeros(1, dtype=np.intp))
+        whole = 10.0 ** (clock_crossing(clock, own) * (1 - 1e-15) + 1e-14)
+        rest = whole - float(np.exp(log_tail_below(own[:1]))[0]) * (1 - 1e-12)  # but for being above at the start
+        cost = float(np.log(max(rest, 0.0) + 1e-300)) + 1e-12
+        if first == 1 and unknown:
+            cost = float(np.logaddexp(cost, log_tail(own[:1])[0]))
+        elif first and own[0] < level[first - 1]:  # the step from the piece before
+            cost = float(np.logaddexp(cost, log_between(own[:1], level[first - 1 : first])[0]))
+        if cost < np.logaddexp.reduce(pieces[first:last]):
+            result[first:last] = -np.inf
+            result[first] = cost
+    return result
+
+
 def _with_share(share: float, known: Array, times: Array, h: Array, level: Array, grown: Array) -> Array:
     """Costs of pieces by comparison with sqrt(a) N + sqrt(1 - a) U, a the share and U an Ornstein-Uhlenbeck process.
 
@@ -187,11 +287,7 @@ def _with_share(share: float, known: Array, times: Array, h: Array, level: Array
     """
     bound, below = known[:, 0], known[:, 1]
     ends = times[1:]
-    after = (bound[:, 1:] - np.where(np.arange(len(ends)) == 0, 0.0, below[:, :-1]) - share) / (1 - share)
-    before = (bound[:, 1:-1] - below[:, 1:-1] - share) / (1 - share)
-    speed = np.where(after > 0, -np.log(np.minimum(after, 1.0)) / ends, np.inf)
-    speed[:, 1:] = np.maximum(speed[:, 1:], np.where(before > 0, -np.log(np.minimum(before, 1.0)) / ends[:-1], np.inf))
-    speed = np.maximum.accumulate(np.where(np.isnan(speed), np.inf, speed), axis=1) * (1 + 1e-12) + 1e-300
+    speed = _speeds(share, bound, below, ends)
     length = np.minimum(ends, h[:, None])
     more = (grown / (1 - share))[:, None]
     whole = speed * length
@@ -220,6 +316,15 @@ def _with_share(share: float, known: Array, times: Array, h: Array, level: Array
         own = use & (chosen == number)
         result[own] = _mixed_costs(constant[own], level[own], number) + np.log(count[own])
     return result
+
+
+def _speeds(share: float, bound: Array, below: Array, ends: Array) -> Array:
+    """The least k with g/s^2 >= a + (1 - a) e^{-k x} for all lags x up to the end of each cell, (P, J)."""
+    after = (bound[:, 1:] - np.where(np.arange(len(ends)) == 0, 0.0, below[:, :-1]) - share) / (1 - share)
+    before = (bound[:, 1:-1] - below[:, 1:-1] - share) / (1 - share)
+    speed = np.where(after > 0, -np.log(np.minimum(after, 1.0)) / ends, np.inf)
+    speed[:, 1:] = np.maximum(speed[:, 1:], np.where(before > 0, -np.log(np.minimum(before, 1.0)) / ends[:-1], np.inf))
+    return np.asarray(np.maximum.accumulate(np.where(np.isnan(speed), np.inf, speed), axis=1) * (1 + 1e-12) + 1e-300)
 
 
 def _mixed_costs(constant: Array, level: Array, clock: int) -> Array:

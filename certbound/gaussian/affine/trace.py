@@ -133,7 +133,7 @@ class Trace:
                 error = root_up(floats(squares)[1]) * step**1.5 * _CHORD * factor * (1 + 1e-12)
             result[f"{name} error"] = error.tolist()
         pushed = np.zeros(len(rows))
-        for place in range(len(law.pushes)):
+        for place in range(len(law.disturbances)):
             images = rows_of(matrix * doubling.gramian(f"push{place}", level))
             squares = [square_of(r, image) for r, image in zip(rows, images)]
             pushed += root_up(floats(squares)[1]) * np.sqrt(step) * (1 + 1e-12)

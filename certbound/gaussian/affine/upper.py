@@ -18,7 +18,7 @@ from flint import arb, arb_mat
 from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.lagged import Costs, Spans, Watched, choose_marks, lagged_cost
 from certbound.gaussian.affine.law import AffineLaw, root_up
-from certbound.gaussian.affine.rough import Decays, lags_of, rough_parts
+from certbound.gaussian.affine.rough import Decays, joined_parts, lags_of, rough_parts
 from certbound.gaussian.affine.smooth import smooth_parts
 from certbound.gaussian.affine.trace import Trace
 from certbound.gaussian.scalar import log_tail
@@ -90,6 +90,9 @@ class Exit:
                 if self.decays is None:
                     self.decays = Decays(trace, lags_of(trace, self.law.horizon))
                 first, pieces = rough_parts(trace, self.decays, lines, chosen, closely=closely)
+                if closely:
+                    self.peaks[len(found)] = pieces
+                    pieces = joined_parts(trace, self.decays, lines, chosen, pieces)
                 about = np.where(self._loose(lines)[chosen], -np.inf, pieces)
             found.append((float(first[0]), pieces, chosen))
             logs.append((pieces, about, chosen))
@@ -161,6 +164,9 @@ class Exit:
             best = max(best, self._product(*self._two_sided(closely=True)))
         if split:
             self.parts, _ = self._evaluate(closely=True)
+        if self.law.resting and self.limits[0].bound == self.limits[1].bound:
+            both = 2 * float(np.exp(self.log_of(0))) * (1 + 1e-12)
+            best = max(best, float(np.log1p(-both)) - 1e-12) if both < 1 else best
         return best if best > -np.inf else None
 
     def _two_sided(self, *, closely: bool = False) -> tuple[Array, Array]:
@@ -235,8 +241,8 @@ def _by_first_crossings(
     logs: list[float],
 ) -> float:
     """By crossings that were within all limits a while before, where the mean stands still."""
-    resting = law.still and law.starts is None and not law.pushes and law.dimension <= _MOST_STATES
-    if not resting or any(limit.during is not None or limit.bound <= 0 for limit in limits):
+    plain = all(limit.during is None and limit.bound > 0 for limit in limits)
+    if not (plain and law.resting and law.dimension <= _MOST_STATES):
         return 0.0
     top = float(np.logaddexp.reduce(logs))
     spans = Spans(law)
@@ -297,6 +303,8 @@ class Side:
         if first > 0:
             high = trace.spread_of()[1][max(piece - 1, 0) : piece + 2].max()
             head = float(np.exp(log_tail(self.level / root_up(high) * (1 - 1e-12))))
+        if self.after is None and first == 0 and last == self.exit.law.horizon:
+            return float(np.exp(self.exit.log_of(self.number)))
         plain = self.exit.costs_of(self.number)
         middle = last
         after = 0.0

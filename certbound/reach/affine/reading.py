@@ -18,7 +18,7 @@ from certbound.problem.sets import Box, Faces
 from certbound.problem.systems import ContinuousSystem
 from certbound.reach.sets import limit_names
 
-_MOST_STATES = 250
+_MOST_STATES, _MOST_DRIVEN = 250, 80  # and where noise drives a limit's row itself, which takes covariance matrices
 
 BALLS: dict[str, Callable[..., arb]] = {
     "const": arb, "neg": lambda x: -x, "add": lambda x, y: x + y, "sub": lambda x, y: x - y,
@@ -67,7 +67,7 @@ class AffineModel:
             starts = arb_mat(size, len(wide))
             for column, i in enumerate(wide):
                 starts[i, column] = (arb(float(hull.hi[i])) - arb(float(hull.lo[i]))) / 2
-        pushes: list[arb_mat] = []
+        disturbances: list[arb_mat] = []
         if box is not None:
             gains = _values(problem, middle, _by_disturbances(problem))
             count = len(middle)
@@ -75,10 +75,10 @@ class AffineModel:
                 push = arb_mat(size, 1)
                 for i in range(n):
                     push[i, 0] = gains[i * count + j] * (arb(b) - arb(a)) / 2
-                pushes.append(push)
+                disturbances.append(push)
         return AffineLaw(
             slope=arb_mat(entries), noise=arb_mat(noise.tolist()), horizon=float(problem.horizon),
-            mean=arb_mat([[x] for x in mean]), starts=starts, covariance=covariance, pushes=tuple(pushes),
+            mean=arb_mat([[x] for x in mean]), starts=starts, covariance=covariance, disturbances=tuple(disturbances),
         )  # fmt: skip
 
 
@@ -122,6 +122,8 @@ def affine_model(problem: Problem) -> AffineModel | None:
         return None
     limits = _limits(problem)
     if limits is None or not limits[1]:
+        return None
+    if n > _MOST_DRIVEN and any(np.any(np.asarray(row) @ np.asarray(system.diffusion)) for row in limits[0]):
         return None
     box = system.disturbance
     middle = [] if box is None else [(arb(a) + arb(b)) / 2 for a, b in zip(box.low.tolist(), box.high.tolist())]
