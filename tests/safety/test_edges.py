@@ -361,7 +361,6 @@ def check_rows(rows: Iterator[Row], said: set[str], *, among: tuple[str, ...] = 
 def _coarse_grids(monkeypatch: pytest.MonkeyPatch) -> None:
     """Value functions on grids that take little: rows ask on which side of the truth a bound lies."""
     monkeypatch.setattr(values, "_SECONDS", 1.0)
-    monkeypatch.setattr(values, "_SPACE", 1.0)
     monkeypatch.setattr(values, "_BACKWARD", 2.0)
 
 
