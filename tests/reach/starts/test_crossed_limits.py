@@ -15,7 +15,7 @@ from certbound.rigor.intervals import Interval
 
 @pytest.mark.parametrize("outside", [False, True])
 @pytest.mark.parametrize("region", [cb.Ball([0.0, 0.0], 1e6), cb.Box([-1.0, -1.0], [1.0, 1.0])])
-def test_paths_of_which_nothing_is_known_neither_keep_a_constraint_nor_break_it(region: cb.Ball | cb.Box, outside: bool) -> None:
+def test_unknown_paths_neither_keep_a_constraint_nor_break_it(region: cb.Ball | cb.Box, outside: bool) -> None:
     """inf - inf is no number, which compares with nothing: such a cell was counted as kept."""
     span = Interval(np.array([0.0, 1.0, 2.0]), np.array([1.0, 2.0, 3.0]))
     paths = StartPaths(
