@@ -70,7 +70,7 @@ def _standard(response: LinearResponse, events: Exceedances) -> tuple[Array, Arr
         ends = events.levels / np.sqrt(low), events.levels / np.sqrt(high)
     known = low > 0
     small, large = (np.where(known, end, np.inf) for end in (np.minimum(*ends), np.maximum(*ends)))
-    return small - _ROUND * np.abs(small), large + _ROUND * np.abs(large)
+    return small * (1 - _ROUND * np.sign(small)), large * (1 + _ROUND * np.sign(large))
 
 
 def _correlations(response: LinearResponse, events: Exceedances) -> Array:

@@ -89,6 +89,17 @@ def test_the_union_is_de_caens_bound():
     assert events.union(response) <= expected * (1 + 1e-5)
 
 
+def test_rows_that_no_noise_has_reached_exceed_nothing():
+    """At time 0 and along a state without noise: levels in standard deviations are infinite, without a word."""
+    eye = np.eye(2)[None, None]
+    response = discrete_response(np.repeat(0.5 * eye, 2, axis=1), np.diag([1.0, 0.0]), 0.0, np.zeros((1, 1)))
+    rows = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
+    events = Exceedances(nodes=np.array([0, 1, 2, 2]), rows=rows, levels=np.array([-1.0, -1.0, 0.5, 0.5]),
+                         lost=np.zeros(4))  # fmt: skip
+    assert events.chances(response)[:3].tolist() == [0.0, 0.0, 0.0]
+    assert events.union(response) == pytest.approx(norm.sf(0.5 / math.sqrt(1.25)), rel=1e-6)
+
+
 @pytest.mark.parametrize(("z", "cost"), [(-1.3, 2.0), (0.4, 1.0), (2.0, 0.5)])
 def test_pushed_noise_costs_what_neyman_and_pearson_say(z, cost):
     assert plainly(float(norm.sf(z)), cost) == pytest.approx(norm.sf(z + cost), rel=1e-8)
