@@ -18,7 +18,6 @@ from certbound.quadratic.corners import Cells, Dynamics, curved_axes, grid
 from certbound.quadratic.inequality import corner_levels, prove
 from certbound.quadratic.mirror_images import Mirror, mirrors
 from certbound.quadratic.setting import Setting, make_setting, refuse
-from certbound.quadratic.surroundings import moved_sides, working_boxes
 from certbound.quadratic.wall_attempts import (
     APART,
     NOTHING,
@@ -34,6 +33,7 @@ from certbound.quadratic.wall_attempts import (
     total,
 )  # fmt: skip
 from certbound.quadratic.wall_program import Proposal, StatedCells, propose
+from certbound.quadratic.working_boxes import moved_sides, working_boxes
 from certbound.watch import poll
 
 _MOST_STATES = 12

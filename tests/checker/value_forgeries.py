@@ -457,32 +457,32 @@ def _(data: Data) -> None:
     nodes[nodes.index(["input", 3])] = ["input", 0]
 
 
-@forges("the working box lies in the safe set", "squared", _WHERE, "Surroundings._faces", "was not shown to keep")
+@forges("the working box lies in the safe set", "squared", _WHERE, "WorkingBox._faces", "was not shown to keep")
 def _(data: Data) -> None:
     data["problem"]["constraints"][0]["region"]["high"] = exact([0.3, 1.0])
 
 
-@forges("an obstacle is a wall where it is", "squared", _WHERE, "Surroundings._ball", "at least 0 on its wall")
+@forges("an obstacle is a wall where it is", "squared", _WHERE, "WorkingBox._ball", "at least 0 on its wall")
 def _(data: Data) -> None:
     data["problem"]["constraints"][1]["region"]["center"] = exact([0.3, 0.3])
 
 
-@forges("the starts of a quadratic bound lie in its box", "squared", _WHERE, "Surroundings._start", "working box")
+@forges("the starts of a quadratic bound lie in its box", "squared", _WHERE, "WorkingBox._start", "working box")
 def _(data: Data) -> None:
     data["problem"]["initial"]["radius"] = exact(2.0)
 
 
-@forges("the starts keep what is no side", "squared", _WHERE, "Surroundings._check_start", "not shown to keep")
+@forges("the starts keep what is no side", "squared", _WHERE, "WorkingBox._check_start", "not shown to keep")
 def _(data: Data) -> None:
     data["problem"]["constraints"][1]["region"]["center"] = exact([0.1, 0.1])
 
 
-@forges("quadratic bounds treat no window", "squared", _WHERE, "Surroundings", "has a window")
+@forges("quadratic bounds treat no window", "squared", _WHERE, "WorkingBox", "has a window")
 def _(data: Data) -> None:
     data["problem"]["constraints"][1]["during"] = exact([0.0, 0.3])
 
 
-@forges("quadratic bounds need bounded starts", "squared", _WHERE, "Surroundings._start", "bounded initial set")
+@forges("quadratic bounds need bounded starts", "squared", _WHERE, "WorkingBox._start", "bounded initial set")
 def _(data: Data) -> None:
     data["problem"]["initial"] = {
         "kind": "gaussian", "mean": exact([0.0, 0.0]), "covariance": exact([[1e-4, 0.0], [0.0, 1e-4]])

@@ -18,9 +18,9 @@ from certbound.errors import InfeasibleError
 from certbound.quadratic import QuadraticBound, bound_quadratic, refinement
 from certbound.quadratic.inequality import prove
 from certbound.quadratic.refinement import make_search
-from certbound.quadratic.surroundings import moved_sides, working_box
 from certbound.quadratic.wall_attempts import APART, PIECES, SPLIT, Attempt
 from certbound.quadratic.wall_program import propose
+from certbound.quadratic.working_boxes import moved_sides, working_box
 from certbound.watch import OutOfTime, Watch
 
 

@@ -12,7 +12,7 @@ import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.quadratic import bound_quadratic
 from certbound.quadratic.setting import make_setting, safe_sides
-from certbound.quadratic.surroundings import working_box
+from certbound.quadratic.working_boxes import working_box
 from certbound.safety.answers import Request
 from certbound.safety.engines import quadratic_engine
 from certbound.watch import Watch

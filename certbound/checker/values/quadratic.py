@@ -30,7 +30,7 @@ from certbound.checker.reading import Record, entries, numbers, unpacked, whole,
 from certbound.checker.report import FUNCTION, PRODUCT, Budget, Unproved
 from certbound.checker.statement import Model
 from certbound.checker.values.second_order import Flow, Local
-from certbound.checker.values.walls import Key, Surroundings, Wall
+from certbound.checker.values.walls import Key, Wall, WorkingBox
 from certbound.errors import CertificateError
 
 MOST_STATES = 12
@@ -60,7 +60,7 @@ def check_quadratic(model: Model, value: object, budget: Budget) -> arb:
     if model.plan is not None:
         raise Unproved("this proof does not treat a plan with steps in time")
     flow = Flow(model, budget)
-    around = Surroundings(model, record, flow)
+    around = WorkingBox(model, record, flow)
     stated: list[_Value] = []
     for k, item in enumerate(record.items("bounds", 0, _MOST_BOUNDS)):
         budget.check()
@@ -73,7 +73,7 @@ def check_quadratic(model: Model, value: object, budget: Budget) -> arb:
     return _worst(around, stated)
 
 
-def _check_covered(around: Surroundings, stated: Sequence[_Value]) -> None:
+def _check_covered(around: WorkingBox, stated: Sequence[_Value]) -> None:
     """Every wall that paths can leave through is looked at, at all times."""
     for key in around.walls:
         windows = sorted((one.window for one in stated if key in one.keys), key=lambda window: float(window[0]))
@@ -88,7 +88,7 @@ def _check_covered(around: Surroundings, stated: Sequence[_Value]) -> None:
             raise Unproved("the windows of a wall were not shown to cover the horizon")
 
 
-def _worst(around: Surroundings, walls: Sequence[_Value]) -> arb:
+def _worst(around: WorkingBox, walls: Sequence[_Value]) -> arb:
     """At least the supremum over the starts of the sum over the walls."""
     found = _at_corners(around, walls)
     if around.model.initial.kind == "ball":
@@ -96,7 +96,7 @@ def _worst(around: Surroundings, walls: Sequence[_Value]) -> arb:
     return arb.min(upper(found), arb(1))
 
 
-def _at_corners(around: Surroundings, walls: Sequence[_Value]) -> arb:
+def _at_corners(around: WorkingBox, walls: Sequence[_Value]) -> arb:
     """Over a box of starts, by its corners: every V(0, .) is made convex first."""
     wide = [i for i, (low, high) in enumerate(around.start) if not (low - high).is_zero()]
     if len(wide) > _MOST_CORNERS:
@@ -120,7 +120,7 @@ def _at_corners(around: Surroundings, walls: Sequence[_Value]) -> arb:
     return worst
 
 
-def _over_ball(around: Surroundings, wall: _Value) -> arb:
+def _over_ball(around: WorkingBox, wall: _Value) -> arb:
     """One wall's part over a ball of starts: V at its centre, its slope and half its largest bend there, in radii."""
     initial, n = around.model.initial, around.n
     radius = [arb(initial.radius) / w for w in around.width]
@@ -138,7 +138,7 @@ def _over_ball(around: Surroundings, wall: _Value) -> arb:
 class _Value:
     """What the file states of one wall."""
 
-    def __init__(self, around: Surroundings, flow: Flow, value: object, path: str, budget: Budget) -> None:
+    def __init__(self, around: WorkingBox, flow: Flow, value: object, path: str, budget: Budget) -> None:
         self.record = record = Record(value, path, _NAMES)
         self.around, self.flow, self.budget, self.n = around, flow, budget, around.n
         self.held = wholes(record["held"], record.at("held"), 0, self.n - 1)

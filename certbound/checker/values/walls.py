@@ -32,7 +32,7 @@ class Wall:
     forms: list[arb_mat] = field(default_factory=list)
 
 
-class Surroundings:
+class WorkingBox:
     """The working box, what else bounds S, and the walls by what they are.
 
     A wall's key is (constraint, face), faces counted from 0 and only 0 where it is a ball or an obstacle, or

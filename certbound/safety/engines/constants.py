@@ -240,7 +240,7 @@ class _Work:
             tightest = erosion.tightest()
             return replace(
                 answer, margin=tightest.margin, time=tightest.time, constraint=tightest.label,
-                reason=f"no local constants hold on the reach tube and its surroundings; {self._narrower} less noise.",
+                reason=f"no local constants hold on the reach tube and about it; {self._narrower} less noise.",
             )  # fmt: skip
         return best
 
