@@ -373,11 +373,11 @@ def _plain_costs(levels: Array, clock: Array) -> Array:
 
 
 def _beginning(trace: Trace, k: int, lines: Array) -> float:
-    """P(a Z exceeds the line within a first piece that starts from V = 0), crudely.
+    """P(a Z exceeds the line within a first piece that starts from a V_0 a = 0), crudely.
 
     sup a Z <= sup a G W + int |a A Z|; the first by reflection, the second by E exp(l Y) <= 2 exp(l^2 h^2 e/2).
     """
-    if k != 0 or trace.law.covariance is not None:
+    if k != 0 or trace.s[1][0] > 0:
         return np.inf
     h, z = float(trace.steps[0]), float(np.min(lines[0]))
     if z <= 0:

@@ -10,7 +10,7 @@ and directions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from flint import arb, arb_mat
@@ -26,6 +26,8 @@ from certbound.watch import poll
 
 _NEAR = 0.01  # of the whole, what enclosures may add
 _ROUNDS, _MOST = 60, 6000  # halvings one after the other, and pieces
+_DRAWN = 400  # pieces of a rough row from a random start, where V falls too: more of them cost more
+_FEW, _VAIN = 8, 6  # pieces that are costly to look at, and halvings after which none of them became known: no more
 _LOOSE = 0.12  # in the exponent of a density, what the variance may move over a piece of a rough row
 _SMALL = 1e-3  # of the whole, shared by all pieces, below which a piece is left as it is
 _UNSURE = 1e-300
@@ -58,6 +60,8 @@ class Exit:
     def __post_init__(self) -> None:
         row = [arb(value) for value in self.row]
         self.smooth = all(x.is_zero() for x in (arb_mat([row]) * self.law.noise).entries())
+        if not self.smooth and self.law.covariance is not None:
+            self.law = replace(self.law, kept=tuple(self.row))
         self.trace = Trace(self.law, row, full=not self.smooth)
         self.decays: Decays | None = None
         self.peaks: dict[int, Array] = {}  # of smooth rows: the pieces' costs at their highest rates
@@ -113,9 +117,14 @@ class Exit:
         return np.asarray(moved > _LOOSE)
 
     def _refine(self) -> None:
+        unknown, rounds = 0, 0  # pieces of which nothing is known, and since when there are no fewer
         for _ in range(_ROUNDS):
             poll("pieces of time")
             self.parts, gaps = self._evaluate()
+            rounds = rounds + 1 if _FEW < unknown <= np.sum(np.isinf(gaps)) else 0
+            unknown = int(np.sum(np.isinf(gaps)))
+            if rounds == _VAIN:
+                return
             logs = np.concatenate([np.append(pieces, first) for first, pieces, _ in self.parts])
             top = float(np.max(np.where(np.isfinite(logs), logs, -np.inf), initial=-np.inf))
             if top == -np.inf and not np.any(gaps):
@@ -123,7 +132,7 @@ class Exit:
             whole = np.sum(np.exp(np.where(logs == np.inf, -np.inf, logs) - (top if np.isfinite(top) else 0.0)))
             if not np.any(np.isinf(gaps)) and np.sum(gaps) <= _NEAR * whole:
                 return
-            if len(self.trace) > _MOST:
+            if len(self.trace) > (_MOST if self.smooth or self.law.covariance is None else _DRAWN):
                 return
             worst = np.isinf(gaps)
             least = max(_NEAR * whole / (2 * len(self.trace)), _UNSURE)

@@ -22,7 +22,8 @@ Prove = Callable[..., EngineAnswer]
 def by_law(prove: Prove) -> Prove:
     """The engine, after what the exact law of an affine model says; the lesser bound counts.
 
-    The engine has a few seconds then, for its tubes, and for a certificate that states its own bound.
+    The engine has a few seconds then, for its tubes, and for a certificate that states its own bound; more where the
+    start is random.
     """
 
     def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
@@ -37,7 +38,8 @@ def by_law(prove: Prove) -> Prove:
         if asked.quick:
             return answer
         tubes: EngineAnswer | None = None
-        with limited_to(_TUBES), contextlib.suppress(EngineError):
+        drawn = problem.initial.random  # the tubes may say more there
+        with contextlib.nullcontext() if drawn else limited_to(_TUBES), contextlib.suppress(EngineError):
             tubes = prove(problem, replace(asked, found=lambda _: None))
         if tubes is None or not tubes.applicable:
             return answer

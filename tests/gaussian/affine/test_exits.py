@@ -11,6 +11,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.stats import norm
 
 from certbound.gaussian.affine import AffineLaw, Limit, bound_exits, bound_exits_below
+from certbound.gaussian.affine.upper import Exit
 
 LN10 = np.log(10.0)
 
@@ -151,3 +152,19 @@ def test_a_set_of_starts_counts_its_worst():
 
 def test_beyond_the_limit_everything_fails():
     assert one_sided(law_of([[-1.0]], [0.1], 1.0, mean=[2.0]), [1.0], 1.0) == 0.0
+
+
+def test_a_resting_row_that_a_drawn_state_drives_is_bounded_in_few_pieces():
+    """v starts at 0 with little noise of its own, w from its stationary law: pieces were halved for minutes, in vain."""
+    slope, noise = [[-1.0, 1.0], [0.0, -0.5]], [[0.1, 0.0], [0.0, 0.5]]
+    law = law_of(slope, noise, 5.0, covariance=np.diag([0.0, 0.25]))
+    with ctx.workprec(256):
+        found = Exit(law, (1, 0), [Limit(direction=0, sign=1, bound=1.5)])
+    assert len(found.trace) < 1000
+    rng, paths, step = np.random.default_rng(1), 40_000, 0.005
+    v, w, beyond = np.zeros(paths), 0.5 * rng.normal(size=paths), np.zeros(paths, dtype=bool)
+    for _ in range(1000):
+        kicks = np.sqrt(step) * rng.normal(size=(2, paths))
+        v, w = v + step * (w - v) + 0.1 * kicks[0], w - step * 0.5 * w + 0.5 * kicks[1]
+        beyond |= v > 1.5
+    assert beyond.mean() - 4 * np.sqrt(beyond.mean() / paths) < np.exp(found.log_of(0)) < 1
