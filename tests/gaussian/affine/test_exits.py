@@ -155,7 +155,7 @@ def test_beyond_the_limit_everything_fails():
 
 
 def test_a_resting_row_that_a_drawn_state_drives_is_bounded_in_few_pieces():
-    """v starts at 0 with little noise of its own, w from its stationary law: pieces were halved for minutes, in vain."""
+    """v starts at 0 with little noise of its own, w from its stationary law: pieces were halved for minutes."""
     slope, noise = [[-1.0, 1.0], [0.0, -0.5]], [[0.1, 0.0], [0.0, 0.5]]
     law = law_of(slope, noise, 5.0, covariance=np.diag([0.0, 0.25]))
     with ctx.workprec(256):
