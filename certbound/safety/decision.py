@@ -255,14 +255,14 @@ class _Search:
         if not names:
             return
         names, turn, patience = in_order(names, self.problem, self.answers), [], _PATIENCE * self.watch.left
-        surely = 1 <= self._chance(names[0]) < math.inf
+        promising = 1 <= self._chance(names[0]) < math.inf
         share = _TURN if any(map(self._likely, names[1:])) or not self._likely(names[0]) else _LAST
 
         def others() -> None:
             turn.append(True)
-            with self.watch.share(_LAST if surely else share):
+            with self.watch.share(_LAST if promising else share):
                 self._in_turn(names[1:])
-            if not surely:
+            if not promising:
                 with self.watch.share(share):
                     self.go_on(names[1:], patient=False)
             if self.safe:
@@ -270,7 +270,7 @@ class _Search:
 
         def first_bounds() -> None:
             if not self.safe:
-                self._first_bounds(names[1:], _FIRST if surely else _TURN)
+                self._first_bounds(names[1:], _FIRST if promising else _TURN)
                 if self.safe:
                     raise OutOfTime
             self.watch.remind(max(patience - _SOON, 0.0), others)

@@ -9,7 +9,7 @@ and directions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -213,9 +213,25 @@ class Exits:
 
 
 def bound_exits(
-    law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit], *, plainly: bool = False
+    law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit],
+    first: Callable[[float, tuple[float, ...]], bool] = lambda total, logs: True,
 ) -> Exits:
-    """Bound P(some limit is exceeded), for every start and disturbance of the law; ``plainly`` by the sum of limits."""
+    """Bound P(some limit is exceeded), for every start and disturbance of the law.
+
+    ``first`` is told the sum over limits and its parts, all logarithms, and says whether to look for less.
+    """
+    exits, logs = _one_by_one(law, rows, limits)
+    total = float(np.logaddexp.reduce(logs))
+    if not first(min(total, 0.0), tuple(logs)) or total > _CERTAIN:
+        return Exits(log_probability=min(total, 0.0), logs=tuple(logs))
+    total = min(total, _by_directions(exits, logs), _by_first_crossings(law, rows, limits, exits, logs))
+    return Exits(log_probability=min(total, 0.0), logs=tuple(logs))
+
+
+def _one_by_one(
+    law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit]
+) -> tuple[list[tuple[Exit, list[int]]], list[float]]:
+    """The directions with the numbers of their limits, and what each limit costs."""
     logs = [0.0] * len(limits)
     exits = []
     for direction, row in enumerate(rows):
@@ -224,11 +240,7 @@ def bound_exits(
         exits.append((found, own))
         for number, place in enumerate(own):
             logs[place] = found.log_of(number)
-    total = float(np.logaddexp.reduce(logs))
-    if plainly or total > _CERTAIN:
-        return Exits(log_probability=min(total, 0.0), logs=tuple(logs))
-    total = min(total, _by_directions(exits, logs), _by_first_crossings(law, rows, limits, exits, logs))
-    return Exits(log_probability=min(total, 0.0), logs=tuple(logs))
+    return exits, logs
 
 
 def _by_directions(exits: list[tuple[Exit, list[int]]], logs: list[float]) -> float:

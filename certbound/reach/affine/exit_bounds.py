@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from flint import ctx
@@ -37,8 +38,10 @@ class AffineAnswer:
         return f"the exact law of the linear model gives {log10_text(self.logs[worst])} for '{self.model.names[worst]}'"
 
 
-def affine_answer(problem: Problem, *, plainly: bool = False) -> AffineAnswer | None:
-    """The answer, ``plainly`` the sum over limits.
+def affine_answer(
+    problem: Problem, first: Callable[[AffineAnswer], object] = lambda answer: None
+) -> AffineAnswer | None:  # fmt: skip
+    """The answer; ``first`` is told the sum over limits before that is made smaller.
 
     None where the model is not affine, its noise not additive, or its limits are no fixed half-spaces.
 
@@ -47,14 +50,21 @@ def affine_answer(problem: Problem, *, plainly: bool = False) -> AffineAnswer | 
     model = affine_model(problem)
     if model is None:
         return None
+
+    def answer(total: float, logs: tuple[float, ...]) -> AffineAnswer:
+        return AffineAnswer(model=model, log10_delta=_log10(total), logs=tuple(_log10(log) for log in logs))
+
+    def go_on(total: float, logs: tuple[float, ...]) -> bool:
+        first(answer(total, logs))
+        return True
+
     for bits in _BITS:
         with ctx.workprec(bits):
             try:
-                found = bound_exits(model.law(), model.rows, model.limits, plainly=plainly)
+                found = bound_exits(model.law(), model.rows, model.limits, go_on)
             except Inaccurate:
                 continue
-        logs = tuple(_log10(log) for log in found.logs)
-        return AffineAnswer(model=model, log10_delta=_log10(found.log_probability), logs=logs)
+        return answer(found.log_probability, found.logs)
     return None
 
 
@@ -72,6 +82,8 @@ def affine_failing(problem: Problem) -> AffineFailing | None:
 
     None where `affine_answer` has none, for limits that count in a window of time only, or where nothing is found.
     """
+    if not (problem.initial.random or problem.fixed_start or len(problem.starts) > 1):
+        problem = problem.replace(initial=problem.initial.middle)  # which is of the set, as no middle of a hull need be
     model = affine_model(problem)
     if model is None or any(limit.during is not None for limit in model.limits):
         return None
@@ -79,7 +91,7 @@ def affine_failing(problem: Problem) -> AffineFailing | None:
         with ctx.workprec(bits):
             try:
                 law = model.law()
-                logs = bound_exits(law, model.rows, model.limits, plainly=True).logs
+                logs = bound_exits(law, model.rows, model.limits, lambda total, logs: False).logs
                 order = sorted(range(len(logs)), key=lambda place: -logs[place])
                 likely = [place for place in order[:_FEW] if logs[place] > logs[order[0]] + _PART]
                 asked = [(model.limits[k].direction, model.limits[k].sign, model.limits[k].bound) for k in likely]

@@ -27,12 +27,17 @@ def by_law(prove: Prove) -> Prove:
     """
 
     def proved(problem: Problem, asked: Request = AS_IT_IS) -> EngineAnswer:
-        law = affine_answer(problem, plainly=True) if asked.cells is None else None
+        law = None
+        if asked.cells is None:
+            with contextlib.ExitStack() as stack:
+
+                def first(plain: AffineAnswer) -> None:
+                    asked.found(_answer(plain))
+                    stack.enter_context(held_back())
+
+                law = affine_answer(problem, first)
         if law is None:
             return prove(problem, asked)
-        asked.found(_answer(law))
-        with held_back():
-            law = affine_answer(problem) or law
         answer = _answer(law)
         asked.found(answer)
         if asked.quick:

@@ -79,3 +79,11 @@ def test_a_random_start_is_part_of_the_law():
     random = affine_answer(problem_of(oscillator, initial=start)).log10_delta
     assert random >= affine_answer(problem_of(oscillator)).log10_delta
     assert affine_failing(problem_of(oscillator, initial=start)).probability <= 10**random
+
+
+def test_the_lower_bound_starts_within_the_set_and_is_that_of_the_point():
+    for start in (cb.Box([-0.3, -0.2], [0.4, 0.1]), cb.Ball([0.1, 0.0], 1e-17)):  # whose hull is all rounding
+        problem = problem_of(oscillator, initial=start)
+        found = affine_failing(problem)
+        assert start.contains(np.array(found.start))
+        assert found.probability == affine_failing(problem.replace(initial=found.start)).probability
