@@ -11,6 +11,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.stats import norm
 
 from certbound.gaussian.affine import AffineLaw, Limit, bound_exits, bound_exits_below
+from certbound.gaussian.affine.lagged import Mark, Spans, lagged_cost
 from certbound.gaussian.affine.upper import Exit
 
 LN10 = np.log(10.0)
@@ -168,3 +169,23 @@ def test_a_resting_row_that_a_drawn_state_drives_is_bounded_in_few_pieces():
         v, w = v + step * (w - v) + 0.1 * kicks[0], w - step * 0.5 * w + 0.5 * kicks[1]
         beyond |= v > 1.5
     assert beyond.mean() - 4 * np.sqrt(beyond.mean() / paths) < np.exp(found.log_of(0)) < 1
+
+
+def test_marked_crossings_are_counted_as_often_as_paths_make_them():
+    """Upcrossings of 2 that were at most 2 a period before: their mean number, stationary."""
+    slope, noise, lag, step = np.array([[0.0, 1.0], [-1.0, -0.1]]), np.array([[0.0], [np.sqrt(0.2)]]), 6.28, 0.04
+    law = law_of(slope, noise, 20.0, covariance=np.eye(2))
+    marks = [Mark(row=(1.0, 0.0), lag=lag, sign=1, level=2.0)]
+    with ctx.workprec(256):
+        found = lagged_cost(law, (1.0, 0.0), 2.0, marks, Spans(law)).between(lag, 20.0)
+    flow, added = moved_by(slope, noise, step)
+    root = np.linalg.cholesky(added)
+    rng, paths = np.random.default_rng(3), 10_000
+    x, seen = rng.standard_normal((paths, 2)), []
+    for _ in range(501):
+        seen.append(x[:, 0])
+        x = x @ flow.T + rng.standard_normal((paths, 2)) @ root.T
+    seen, back = np.array(seen), round(lag / step)
+    counted = (seen[back:-1] <= 2) & (seen[back + 1 :] > 2) & (seen[: -back - 1] <= 2)
+    mean = counted.sum() / paths
+    assert mean - 5 * np.sqrt(mean / paths) < found < 1.1 * mean
