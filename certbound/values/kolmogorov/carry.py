@@ -29,6 +29,7 @@ from certbound.values.kolmogorov.equation import (
     Mesh,
     at_knots,
     at_nodes,
+    growing_steps,
     knots_of,
     mesh_of,
     ramp,
@@ -77,6 +78,7 @@ v is .20 and .38, Lorenz' lower side .101 and .103, Josephson's junction .0046 a
 _MANY = 1.0  # log10 of the cells that paths leave within a step, from which on (to ten times as many) e is calm
 _SKETCH = 3  # degree of interpolants where little is at stake: of bulges, and where nothing is proved
 _MAKING_ROOM = 3  # turns until axes have about as many cells as asked
+_FREE = 0.75  # of the longest step: shorter ones follow a layer in time
 _CLOCK = 1e-13  # share of the horizon by which that of an upper bound is longer, of a lower bound shorter
 
 
@@ -165,8 +167,8 @@ class Side:
     setting : Setting
     cell : ndarray, shape (n,)
         Width of a cell as a share of the range.
-    steps : int
-        Steps over the horizon.
+    longest : callable
+        The longest step at each time before the end.
     above : bool
         From above or from below.
     later : Side, optional
@@ -176,10 +178,10 @@ class Side:
     """
 
     def __init__(
-        self, setting: Setting, cell: Array, steps: int, above: bool, parts: int = DEGREE, later: Side | None = None,
+        self, setting: Setting, cell: Array, longest: Size, above: bool, parts: int = DEGREE, later: Side | None = None,
         plan: Plan | None = None,
     ) -> None:  # fmt: skip
-        self.setting, self.above, self.later, self.cell, self.count = setting, above, later, cell, steps
+        self.setting, self.above, self.later, self.cell = setting, above, later, cell
         row = self.row = 0 if above else 1
         span = setting.horizon - setting.begin
         self.layer = END * float(np.mean(cell)) * span
@@ -199,8 +201,11 @@ class Side:
             failed=self.shapes.failed,
         )  # fmt: skip
         longer = 1 + (_CLOCK if above else -_CLOCK)  # the sum of the steps is rounded
-        self.steps = time_steps(span * longer, steps, self.layer, setting.dimension)
-        self._follow_changes(int(np.ceil(setting.pace * steps)))
+        self.steps = self.steps_of(longest) * longer
+        self._follow_changes(longest)
+        passed = np.cumsum(self.steps) - self.steps
+        self.free = self.steps >= _FREE * longest(passed)
+        self.free[-1] = True
         self.maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.mesh.nodes)]
         self.carried_maps = [axis.from_nodes(line) for axis, line in zip(self.axes, self.carrier.nodes)]
         n, noisy = setting.dimension, setting.noisy
@@ -233,23 +238,30 @@ class Side:
         """The same with fewer points on a cell."""
         return _generator(self.setting, tuple(Axis(axis.nodes, Sampling(_SKETCH)) for axis in self.axes))
 
+    def steps_of(self, longest: Size) -> Array:
+        """Steps that grow from the layer at the end on, where no break of the clock is in their way."""
+        return time_steps(self.setting.horizon - self.setting.begin, self._growing(longest))
+
+    def _growing(self, longest: Size) -> Size:
+        return growing_steps(self.layer, longest, self.setting.dimension)
+
     def follow(self, k: int) -> None:
         """Set the equation of the carried error to knot ``k``."""
         self._now(self.carrier, k)
 
-    def on(self, shapes: Sequence[Size]) -> Side:
-        """The same side, of the only stage, on axes of other shapes, and on about as many cells.
+    def on(self, shapes: Sequence[Size], longest: Size) -> Side:
+        """The same side, of the only stage, on axes and steps of other shapes, and with about as much work.
 
         Shapes leave out what limits that paths graze want besides; the other cells make room for it.
         """
-        wanted = np.prod([axis.cells for axis in self.axes])
+        wanted = np.prod([axis.cells for axis in self.axes]) * len(self.steps) / len(self.steps_of(longest))
         wider = 1.0
         for _ in range(_MAKING_ROOM):
             scaled = [partial(_wider, shape, wider) for shape in shapes]
             plan = plan_axes([self.setting], self.cell, self.row, scaled)[0]
             over = float(np.prod([len(line) - 1 for line in plan[0]]) / wanted)
             wider *= max(over, 1.0) ** (1 / self.setting.dimension)
-        return Side(self.setting, self.cell, self.count, self.above, plan=plan)
+        return Side(self.setting, self.cell, longest, self.above, plan=plan)
 
     @property
     def begun(self) -> bool:
@@ -289,14 +301,14 @@ class Side:
                     result.append(Face(axis=k, side=side, leaves=leaves, goal=0.0, place=place))
         return result
 
-    def _follow_changes(self, steps: int) -> None:
+    def _follow_changes(self, longest: Size) -> None:
         """Knots, and what is known of the factors between them, where the generator changes."""
         setting, begin, horizon = self.setting, self.setting.begin, self.setting.horizon
         self.brief = np.zeros(len(self.steps), dtype=bool)  # slabs about breaks: too short to be carried
         self.clock: Array | None = None
         self.times = horizon - np.append(0.0, np.cumsum(self.steps))
         if setting.timed or setting.staged:  # a stage is as long as it is
-            self.times = knots_of(begin, horizon, steps, self.layer, setting.breaks, setting.dimension)
+            self.times = knots_of(begin, horizon, self._growing(longest), self.layer, setting.breaks)
             self.steps = -np.diff(self.times)
             self.brief = self.steps < 4 * HALF * horizon
             self.clock = 2 * CLOCK * horizon / self.steps
@@ -480,14 +492,15 @@ class Side:
         more residual than these exits are worth.
         """
         setting, lines, n = self.setting, self.mesh.nodes, len(self.axes)
-        noise = setting.spread(self.mesh.inside, setting.horizon)
+        noise, flow = (of(self.mesh.inside, setting.horizon) for of in (setting.spread, setting.flow))
         span = np.full(self.mesh.equation.shape, self.layer)
         for i in np.flatnonzero(setting.noisy):
             for side in np.flatnonzero(setting.limited[:, i]):
                 face = tuple(slice(-1 if side else 0, None if side else 1) if k == i else slice(None) for k in range(n))
                 gap = lines[i][-1] - lines[i][-2] if side else lines[i][1] - lines[i][0]
-                crossed = gap**2 / np.maximum(noise[i * n + i][face], 1e-300)
-                span[face] = np.maximum(span[face], _RESOLVED * crossed)
+                out = np.maximum((2 * side - 1) * flow[i][face], 0.0)
+                crossed = noise[i * n + i][face] / (_RESOLVED * gap**2) + out / (np.sqrt(_RESOLVED) * gap)
+                span[face] = np.maximum(span[face], 1 / np.maximum(crossed, 1e-300))
         return np.asarray(np.minimum(span, setting.horizon - setting.begin))
 
     def propose(self) -> None:
@@ -536,6 +549,14 @@ class Side:
 
         ``final`` are knots up to which v will not change any more: slabs between them are bounded while it goes on.
         """
+        found = self._over_slabs(rough, final)
+        return [np.add.reduce(one) for one in found] if rough else found
+
+    def rough_parts(self) -> list[Array]:
+        """About the residuals at knots and what is more of them in between, shape (2, N_1, ...), slab by slab."""
+        return self._over_slabs(True, ())
+
+    def _over_slabs(self, rough: bool, final: Iterable[int]) -> list[Array]:
         count = len(self.steps)
         lattice = int(np.prod([axis.sampling.parts for axis in (self.sketch if rough else self.generator).axes]))
         many = max(1, _BATCH * count // (lattice * self.own_work))
@@ -572,14 +593,14 @@ class Side:
         factors = [None if one is None else one.on(some) for one in self.factors]
         clock = None if self.clock is None else self.clock[some]
         if rough:
-            bound = rough_residual(self.sketch, values, rates, steps, factors, worst=self.above)
+            bound = np.stack(rough_residual(self.sketch, values, rates, steps, factors, worst=self.above), axis=1)
         else:
             knots = np.concatenate([one.result() for one in proved])[-len(values) :] if proved else None
             bound = residual_bound(
                 self.generator, self.sketch, values, rates, steps, factors, worst=self.above, clock=clock, knots=knots
             )
         done = self._decided(values, rates, steps) | self.stopped
-        return list(np.where(done, 0.0, np.maximum(bound, 0.0)))
+        return list(np.where(done[:, None] if rough else done, 0.0, np.maximum(bound, 0.0)))
 
     def _decided(self, values: Array, rates: Array, steps: Array) -> Mask:
         """Cells and slabs on which v is so large that nothing is asked of it any more."""

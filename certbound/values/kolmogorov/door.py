@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from time import perf_counter
 
@@ -214,13 +215,13 @@ class Search:
         if not side.values:
             _propose(side)
         rounds = 0 if above in self.shapes or side.later is not None else 1 if self.shapes else _ROUNDS
-        side, residuals = adapted(side, self.starts, rounds)
+        side, parts = adapted(side, self.starts, rounds)
         value = largest_at_start(side, self.starts)[0]
         self.estimate, self.error = abs(value), math.inf
         self.work += _ROUGH * (1 + rounds) * side.work
-        if residuals is not None:
-            self.shapes[above] = (self.cell, better_shapes(side, residuals, self.starts.places))
-            side.correct(residuals)
+        if parts is not None:
+            self.shapes[above] = (self.cell, better_shapes(side, parts, self.starts.places))
+            side.correct([np.add.reduce(one) for one in parts])
             self.work += _CORRECTED * side.work
             self.error = abs(largest_at_start(side, self.starts)[0] - value)
         return side
@@ -271,7 +272,7 @@ class Search:
 
     def _bounds(self, side: Side, proved: bool = True) -> Bounds:
         return Bounds(
-            lower=self.lower, upper=self.upper, cells=cells_of(side.axes), steps=math.ceil(_STEPS / self.cell),
+            lower=self.lower, upper=self.upper, cells=cells_of(side.axes), steps=len(side.steps),
             runs=self.runs if proved else 0, estimate=self.estimate, work=self.work, witnesses=self.kept, search=self,
         )  # fmt: skip
 
@@ -290,14 +291,15 @@ def _scaled(shapes: Shapes | None, cell: float) -> list[Shape]:
 
 
 def adapted(side: Side, starts: Starts, rounds: int) -> tuple[Side, list[Array] | None]:
-    """A grid of about as many cells that is better for this problem, and about its residuals."""
+    """A grid that is better for this problem with as much work, and about its residuals, as `Side.rough_parts`."""
     if side.later is not None:
         return side, None
     while side.finite:
-        residuals = side.residuals(rough=True)
+        parts = side.rough_parts()
         if not rounds:
-            return side, residuals
-        side = side.on(better_shapes(side, residuals, starts.places))
+            return side, parts
+        *shapes, longest = better_shapes(side, parts, starts.places)
+        side = side.on(shapes, longest)
         side.propose()
         rounds -= 1
     return side, None
@@ -306,13 +308,18 @@ def adapted(side: Side, starts: Starts, rounds: int) -> tuple[Side, list[Array] 
 def side_of(
     stages: Sequence[Setting], cell: float, count: int, above: bool, shapes: Sequence[Shape] = ()
 ) -> Side:  # fmt: skip
-    """One bound on one grid, of the first of the stages; ``count`` steps go over all of them."""
+    """One bound on one grid, of the first of the stages.
+
+    ``count`` steps go over all of them, or those of the last one of ``shapes``, which are those of `better_shapes`.
+    """
     cells = np.full(stages[0].dimension, cell)
-    plans = plan_axes(stages, cells, 0 if above else 1, shapes)
+    plans = plan_axes(stages, cells, 0 if above else 1, shapes[:-1])
     later: Side | None = None
     for one, plan in zip(reversed(stages), reversed(plans)):
-        share = (one.horizon - one.begin) / stages[-1].horizon
-        later = Side(one, cells, max(math.ceil(share * count), _FEWEST), above, later=later, plan=plan)
+        span = one.horizon - one.begin
+        usual = span / math.ceil(one.pace * max(math.ceil(span / stages[-1].horizon * count), _FEWEST))
+        longest = shapes[-1] if shapes else partial(np.full_like, fill_value=usual)
+        later = Side(one, cells, longest, above, later=later, plan=plan)
     assert later is not None
     return later
 

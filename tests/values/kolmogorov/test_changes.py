@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.linalg import solve_banded
@@ -11,8 +13,7 @@ from certbound.errors import EnclosureError, InfeasibleError
 from certbound.problem.model import compile_numpy
 from certbound.values.kolmogorov import bound_failing
 from certbound.values.kolmogorov.box_setting import Setting, stages_of
-from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.door import refined, starts_in
+from certbound.values.kolmogorov.door import refined, side_of, starts_in
 from certbound.values.kolmogorov.equation import knots_of
 from certbound.values.kolmogorov.factors import HALF, clock_breaks, disturbance_nodes, factor_of
 from certbound.values.kolmogorov.products import separated
@@ -128,7 +129,7 @@ def test_the_clock_s_jumps_and_bends_are_found_and_each_stands_in_a_slab_of_its_
     ).dynamics  # fmt: skip
     breaks = clock_breaks([tape], 2.0)
     assert np.allclose(breaks, [0.3, 0.9, np.pi / 2, 1.8], atol=1e-12)
-    times = knots_of(0.0, 2.0, 20, 0.1, breaks, 2)
+    times = knots_of(0.0, 2.0, partial(np.full_like, fill_value=0.1), 0.1, breaks)
     assert times[0] == 2.0
     assert times[-1] == 0.0
     assert np.all(np.diff(times) < 0)
@@ -155,7 +156,7 @@ def test_the_residual_of_a_random_function_lies_below_its_bound_at_all_times(nam
         return [[0.4 + 0.1 * np.sin(4 * t) * x[0], 0.0], [0.2, 0.3 * np.exp(-t)]]
 
     setting = stages_of(problem(name, noise))[0]
-    side = Side(setting, np.full(2, 0.3), 6, above)
+    side = side_of([setting], 0.3, 6, above)
     shape = (len(side.steps) + 1, *(axis.cells + 5 for axis in side.axes))
     side.values, side.rates = list(rng.normal(size=shape)), list(rng.normal(size=shape))
     side._decided = lambda *given: np.zeros(given[0][1:, :-5, :-5].shape, dtype=bool)
@@ -231,7 +232,7 @@ TIMED = {
 @pytest.mark.parametrize(("name", "disturbed"), [("swinging", False), ("switched", False), ("swinging", True)])
 def test_two_states_apart_fail_as_often_as_the_bounds_say(name: str, disturbed: bool, above: bool) -> None:
     asked, truth = two_apart(TIMED[name], disturbed)
-    side = Side(stages_of(asked)[0], np.full(2, 0.06), 30, above)
+    side = side_of([stages_of(asked)[0]], 0.06, 30, above)
     side.propose()
     bound, _, _ = refined(side, starts_in(asked))
     if above:
@@ -255,7 +256,7 @@ def test_the_bounds_are_close_where_there_is_time(name: str, disturbed: bool) ->
 def test_a_wrong_proposal_costs_width_and_never_truth(above: bool, wrong: str) -> None:
     asked, truth = two_apart(TIMED["swinging"], True)
     setting, rng = stages_of(asked)[0], np.random.default_rng(7)
-    side = Side(setting, np.full(2, 0.1), 12, above)
+    side = side_of([setting], 0.1, 12, above)
     if wrong == "policy":  # the disturbances that do least
         side._worst = lambda mesh, time, a: np.zeros(mesh.equation.shape, dtype=np.intp)
     side.propose()
@@ -277,7 +278,7 @@ def test_a_face_that_paths_can_leave_through_for_some_time_or_disturbance_only_i
     ):
         moved = cb.ContinuousSystem(text, states=2, diffusion=[[0.0], [0.5]], **box)
         asked = cb.Problem(moved, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1], [1, 1]))], horizon=2.0)
-        side = Side(stages_of(asked)[0], np.full(2, 0.2), 8, True)
+        side = side_of([stages_of(asked)[0]], 0.2, 8, True)
         upper = next(face for face in side.faces if (face.axis, face.side) == (0, 1))
         if box:
             assert upper.leaves.all()
@@ -294,7 +295,7 @@ def test_a_root_that_no_factor_shows_is_refused_where_it_is_undefined() -> None:
     setting = stages_of(asked)[0]
     assert isinstance(setting, Setting)
     with pytest.raises(EnclosureError, match="undefined"):
-        Side(setting, np.full(2, 0.2), 8, True)
+        side_of([setting], 0.2, 8, True)
 
 
 def test_no_lower_bound_is_said_of_unknown_constants_or_of_disturbances_where_the_drift_jumps() -> None:

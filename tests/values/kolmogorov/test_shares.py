@@ -12,7 +12,6 @@ from certbound.values.kolmogorov.door import adapted, side_of, starts_in
 from certbound.values.kolmogorov.equation.solve import Equation, SplitEquation
 from certbound.values.kolmogorov.equation.sources import Breadth, at_knots, at_nodes
 from certbound.values.kolmogorov.error_shares import better_shapes, shares
-from certbound.values.kolmogorov.splines import cells_of
 
 
 def near_one_limit() -> cb.Problem:
@@ -22,7 +21,7 @@ def near_one_limit() -> cb.Problem:
 
 
 def proposed(above: bool) -> Side:
-    side = Side(stages_of(near_one_limit())[0], np.full(2, 0.08), 12, above)
+    side = side_of([stages_of(near_one_limit())[0]], 0.08, 12, above)
     side.propose()
     return side
 
@@ -30,8 +29,9 @@ def proposed(above: bool) -> Side:
 @pytest.mark.parametrize("above", [True, False])
 def test_shares_add_up_to_what_is_carried_to_the_start(above: bool) -> None:
     side, starts = proposed(above), starts_in(near_one_limit())
-    residuals = side.residuals(rough=True)
-    total = sum(float(one.sum()) for one in shares(side, residuals, starts.places))
+    parts = side.rough_parts()
+    residuals = [np.add.reduce(one) for one in parts]
+    total = sum(float(one.sum()) for one in shares(side, parts, starts.places))
     equation = side.carrier.equation
     e = np.zeros(equation.shape)
     for residual, step in zip(residuals, side.steps):
@@ -42,16 +42,16 @@ def test_shares_add_up_to_what_is_carried_to_the_start(above: bool) -> None:
 
 def test_as_many_cells_leave_less_error_where_axes_follow_the_shares() -> None:
     side, starts = proposed(above=False), starts_in(near_one_limit())
-    before = sum(float(one.sum()) for one in shares(side, side.residuals(), starts.places))
+    before = sum(float(one.sum()) for one in shares(side, side.rough_parts(), starts.places))
     better, _ = adapted(side, starts, 2)
-    after = sum(float(one.sum()) for one in shares(better, better.residuals(), starts.places))
-    assert np.prod(cells_of(better.axes)) < 1.2 * np.prod(cells_of(side.axes))
+    after = sum(float(one.sum()) for one in shares(better, better.rough_parts(), starts.places))
+    assert better.work < 1.2 * side.work
     assert after < 0.5 * before
 
 
 def test_cells_change_by_no_more_than_shares_tell() -> None:
     side, starts = proposed(above=True), starts_in(near_one_limit())
-    for axis, shape in zip(side.axes, better_shapes(side, side.residuals(rough=True), starts.places)):
+    for axis, shape in zip(side.axes, better_shapes(side, side.rough_parts(), starts.places)):
         change = shape(shape.places) / axis.widths
         assert change.max() < 4
         assert np.abs(np.diff(shape.sizes) / np.diff(shape.places)).max() < 0.3 * 3
@@ -143,7 +143,8 @@ def test_axes_that_are_improved_again_and_again_do_not_swing() -> None:
     side, counts = side_of(stages_of(problem), 0.2, 8, True), []
     side.propose()
     for _ in range(3):
-        side = side.on(better_shapes(side, side.residuals(True), np.array([[0.1, 0.1, 0.1]])))
+        *shapes, longest = better_shapes(side, side.rough_parts(), np.array([[0.1, 0.1, 0.1]]))
+        side = side.on(shapes, longest)
         side.propose()
         counts.append([axis.cells for axis in side.axes])
     changes = np.abs(np.diff(np.log(counts), axis=0))

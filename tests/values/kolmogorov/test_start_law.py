@@ -11,8 +11,7 @@ import certbound as cb
 from certbound.errors import InfeasibleError
 from certbound.values.kolmogorov import bound_failing, start_law
 from certbound.values.kolmogorov.box_setting import stages_of
-from certbound.values.kolmogorov.carry import Side
-from certbound.values.kolmogorov.door import refined, starts_in
+from certbound.values.kolmogorov.door import refined, side_of, starts_in
 from certbound.values.kolmogorov.splines import Axis, Sampling
 from certbound.values.kolmogorov.start_law import StartMean, directions_of
 from certbound.values.room import limits_of
@@ -106,7 +105,7 @@ def two_apart(covariance: list[float]) -> tuple[cb.Problem, float]:
 @pytest.mark.parametrize("wrong", [False, True])
 def test_a_random_start_fails_as_often_as_the_bounds_say_whatever_is_proposed(above: bool, wrong: bool) -> None:
     asked, truth = two_apart([0.04, 0.09])
-    side = Side(stages_of(asked)[0], np.full(2, 0.06), 30, above)
+    side = side_of([stages_of(asked)[0]], 0.06, 30, above)
     side.propose()
     if wrong:
         rng = np.random.default_rng(0)

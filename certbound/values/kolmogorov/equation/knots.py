@@ -2,45 +2,59 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from certbound.arrays import Array
+from certbound.values.kolmogorov.axes import Size
 from certbound.values.kolmogorov.factors import HALF
 
 _FIRST = 12  # steps within the layer at the end
-_GROWTH = {2: 1.15, 3: 1.3}  # of these steps: a front leaves it sharp, and blurs slowly; by the number of states
-_AFTER, _QUICKER = 0.25, 1.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
+_GROWTH = {2: 0.15, 3: 0.3}  # of steps with the time passed: a front leaves it sharp, and blurs slowly; by the number
+# of states
+_AFTER, _QUICKER = 0.25, 0.5  # first step after a jump of the clock, as a share of that layer, and how steps grow
+_RUNG = 1.07  # ratio of the lengths that steps have: an equation that does not change is factored once for each
 
 
-def time_steps(horizon: float, count: int, layer: float, states: int) -> Array:
-    """Lengths of the steps from the end backward: small in the end layer, growing to horizon / count."""
-    return _graded(horizon, horizon / count, layer / _FIRST, _GROWTH[states])
+def growing_steps(layer: float, longest: Size, states: int) -> Size:
+    """Lengths of steps that grow from the layer at the end on, to ``longest``."""
+    return partial(_least, longest, 0.0, partial(_growing, layer / _FIRST, _GROWTH[states]))
 
 
-def _graded(length: float, largest: float, first: float, growth: float) -> Array:
-    step = first
+def _growing(first: float, growth: float, passed: Array) -> Array:
+    return first + growth * np.maximum(passed, 0.0)
+
+
+def time_steps(horizon: float, longest: Size) -> Array:
+    """Lengths of the steps from the end backward, each about ``longest`` at the time passed before it."""
+    return _graded(horizon, longest)
+
+
+def _graded(length: float, longest: Size) -> Array:
+    first = float(longest(np.array(0.0)))
     result: list[float] = []
-    while step < largest and sum(result) + step < length:
-        result.append(step)
-        step *= growth
-    rest = length - sum(result)
-    more = max(int(np.ceil(rest / largest)), 1)
-    return np.array(result + [rest / more] * more)
+    passed = 0.0
+    while passed < length * (1 - 1e-9):
+        rung = np.floor(np.log(float(longest(np.array(passed))) / first) / np.log(_RUNG) + 1e-9)
+        result.append(float(first * _RUNG**rung))
+        passed += result[-1]
+    return np.array(result) * (length / passed)
 
 
-def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Array, states: int) -> Array:
+def knots_of(begin: float, horizon: float, longest: Size, layer: float, breaks: Array) -> Array:
     """Times of the knots, from the horizon back: as `time_steps`, with two about every break.
 
     Before a break, backward in time, a solution that does not fit the new coefficients at faces has a layer in time.
     """
-    half, largest = HALF * horizon, (horizon - begin) / count
+    half = HALF * horizon
     ends = horizon - np.append(breaks[::-1], begin)  # passed, backward
     passed = [0.0]
     for k, end in enumerate(ends):
         last = end - half if k < len(breaks) else end
-        first, faster = (layer / _FIRST, _GROWTH[states]) if k == 0 else (layer * _AFTER, _QUICKER)
         so_far = passed[-1]
-        passed += list(so_far + np.cumsum(_graded(last - so_far, largest, first, faster)))
+        least = partial(_growing, layer * _AFTER, _QUICKER) if k else partial(np.full_like, fill_value=np.inf)
+        passed += list(so_far + np.cumsum(_graded(last - so_far, partial(_least, longest, so_far, least))))
         passed[-1] = last
         if k < len(breaks):
             passed.append(end + half)
@@ -49,4 +63,8 @@ def knots_of(begin: float, horizon: float, count: int, layer: float, breaks: Arr
     return np.asarray(times)
 
 
-__all__ = ["knots_of", "time_steps"]
+def _least(longest: Size, begin: float, other: Size, passed: Array) -> Array:
+    return np.minimum(longest(begin + passed), other(passed))
+
+
+__all__ = ["growing_steps", "knots_of", "time_steps"]

@@ -229,13 +229,16 @@ def residual_bound(
 def rough_residual(
     generator: Generator, values: Array, rates: Array, steps: Array, factors: Sequence[Factor | None] = (None,),
     *, worst: bool = True,
-) -> Array:  # fmt: skip
-    """About the same, from values at lattice points alone: nothing is proved of it."""
+) -> tuple[Array, Array]:  # fmt: skip
+    """About the same, from values at lattice points: what is left at knots, by the cells, and in between, by steps.
+
+    Nothing is proved of it.
+    """
     h = steps.reshape(-1, *[1] * len(generator.axes))
     lines = _lines(generator, values, rates, factors, worst, proved=False)
     bulge, middle = _bulges(values, rates, h)
     more = _most_of_bulge(generator, bulge, middle, factors, proved=False)
-    return np.asarray(lines + np.maximum(more, 0.0))
+    return lines, np.maximum(more, 0.0)
 
 
 _LATE, _EARLY, _EVERY = slice(None, -1), slice(1, None), slice(None)
