@@ -27,11 +27,6 @@ _DAMPED = 0.5  # of what would balance the axes: of coarse cells shares fall fas
 # that follow them at once swing between two grids (errors of Lorenz' model from below: .01 and .04, by turns)
 _FINER, _WIDER = 3.0, 1.5  # largest changes of a cell: what shares tell of much larger ones is not to be trusted
 _SETTLED = 5
-_IN_TIME = 10.0
-"""What an error by steps counts for against one by cells: sources of the passes after the first differ from cell to
-cell, and steps that lead paths across several of them leave errors of e besides those of v. With 1, 10 and 40, at ten
-units of work, friction's bounds are [0, .0064], [.0015, .0052], [.0008, .0053], a pushed pendulum's [.058, .173],
-[.079, .144], [.074, .138], Heston's from above .106, .102, .104."""
 _SECOND, _UPWIND = 1 / 100, 1 / 12  # what errors of second derivatives and of upwind differences are of theirs
 
 
@@ -61,10 +56,10 @@ def better_shapes(side: Side, parts: Sequence[Array], starts: Array) -> list[Sha
 
     ``parts`` are those of `Side.rough_parts`.
     """
-    *along, by_steps = shares(side, parts, starts)
+    (*along, by_steps), crossed = _due(side, parts, starts)
     rows = [((axis.nodes[1:] + axis.nodes[:-1]) / 2, axis.widths, share) for axis, share in zip(side.axes, along)]
     passed = np.cumsum(side.steps) - side.steps / 2
-    rows.append((passed[side.free], side.steps[side.free], by_steps[side.free]))
+    rows.append((passed[side.free], side.steps[side.free], max(crossed, 1.0) * by_steps[side.free]))
     *shapes, longest = _shapes(rows)
     cells = np.prod([float((width / shape(middle)).sum()) / len(width) for (middle, width, _), shape in zip(rows, shapes)])
     steps = len(side.steps_of(longest)) / len(side.steps)  # steps within layers are as they were
@@ -76,19 +71,32 @@ def shares(side: Side, parts: Sequence[Array], starts: Array) -> list[Array]:
 
     The last row, shape (slabs,), is what is due to each step.
     """
+    return _due(side, parts, starts)[0]
+
+
+def _due(side: Side, parts: Sequence[Array], starts: Array) -> tuple[list[Array], float]:
+    """The shares, and how many cells paths cross within a step, in the mean.
+
+    Sources of all passes but the first differ from cell to cell. Steps that lead paths across several of them leave as
+    many times the error of what is carried that they leave of v.
+    """
     n = len(side.axes)
+    crossed, paths = 0.0, 0.0
+    leaving = _at_cells(side, side.carrier.leaving)
     result = [np.zeros(axis.cells) for axis in side.axes] + [np.zeros(len(side.steps))]
     for slabs, time in _occupation(side, starts):
         by_cells, by_steps = (np.array([side.steps[k] * parts[k][j] for k in slabs]) * time for j in (0, 1))
         due = by_cells.sum(axis=0)
         due[side.shapes.cut] = 0.0  # what edges leave there is due to no axis
         result[n][slabs] = by_steps.reshape(len(slabs), -1).sum(axis=1)
+        crossed += float((time * leaving).sum() * (side.steps[slabs] ** 2).sum())
+        paths += float(time.sum() * side.steps[slabs].sum())
         along = _indicators(side, slabs[len(slabs) // 2])
         total = np.add.reduce(along) + 1e-300
         for i in range(n):
             others = tuple(j for j in range(n) if j != i)
             result[i] += np.maximum((due * along[i] / total).sum(axis=others), 0.0)
-    return result
+    return result, crossed / max(paths, 1e-300)
 
 
 def _occupation(side: Side, starts: Array) -> Iterator[tuple[list[int], Array]]:
@@ -106,12 +114,16 @@ def _occupation(side: Side, starts: Array) -> Iterator[tuple[list[int], Array]]:
             continue
         side.follow(k)
         there = equation.adjoint(longest, there)
-        cells = there
-        for i, (before, behind) in enumerate(side.carrier.pad):
-            line = np.moveaxis(cells, i, 0)[before : cells.shape[i] - behind]
-            cells = np.moveaxis((line[1:] + line[:-1]) / 2, 0, i)
-        yield slabs, np.maximum(cells, 0.0)
+        yield slabs, np.maximum(_at_cells(side, there), 0.0)
         slabs, gone = [], 0.0
+
+
+def _at_cells(side: Side, nodes: Array) -> Array:
+    """Means over the corners of every cell, of values at the nodes on which e is solved for."""
+    for i, (before, behind) in enumerate(side.carrier.pad):
+        line = np.moveaxis(nodes, i, 0)[before : nodes.shape[i] - behind]
+        nodes = np.moveaxis((line[1:] + line[:-1]) / 2, 0, i)
+    return nodes
 
 
 def _indicators(side: Side, knot: int) -> list[Array]:
@@ -153,7 +165,6 @@ def _shapes(rows: Sequence[tuple[Array, Array, Array]]) -> list[Shape]:
         sizes *= float((width / sizes).sum()) / count
         wholes.append(float((constant * width * sizes**_POWER).sum()))
         shapes.append(Shape(places=middle, sizes=sizes))
-    wholes[-1] *= _IN_TIME
     usual = np.exp(np.mean(np.log(np.maximum(wholes, 1e-300))))
     turns = np.clip((usual / np.maximum(wholes, 1e-300)) ** (_DAMPED / _POWER), 1 / _TURN, _TURN)
     return [Shape(places=one.places, sizes=one.sizes * turn) for one, turn in zip(shapes, turns)]
