@@ -61,9 +61,9 @@ def better_shapes(side: Side, parts: Sequence[Array], starts: Array) -> list[Sha
     passed = np.cumsum(side.steps) - side.steps / 2
     rows.append((passed[side.free], side.steps[side.free], max(crossed, 1.0) * by_steps[side.free]))
     *shapes, longest = _shapes(rows)
-    cells = np.prod([float((width / shape(middle)).sum()) / len(width) for (middle, width, _), shape in zip(rows, shapes)])
+    finer = [float((width / shape(middle)).mean()) for (middle, width, _), shape in zip(rows, shapes)]
     steps = len(side.steps_of(longest)) / len(side.steps)  # steps within layers are as they were
-    return [*(shape.scaled(float(cells * steps) ** (1 / len(shapes))) for shape in shapes), longest]
+    return [*(shape.scaled(float(np.prod(finer) * steps) ** (1 / len(shapes))) for shape in shapes), longest]
 
 
 def shares(side: Side, parts: Sequence[Array], starts: Array) -> list[Array]:
