@@ -1,17 +1,19 @@
 """Bounds of the probability that a centred normal process along a row exceeds a level on a piece of time.
 
-Each is an inequality of docs/theory.md, section 9 ("Affine models exactly"). Three of them serve a piece:
+A level z changes evenly over a piece. Each bound is an inequality of docs/theory.md, section 9 ("Affine models
+exactly"). Three of them serve a piece:
 
-- `rice`, of rows without noise of their own (a G = 0): E(upcrossings) <= int phi(z/s)/s E[eta^+ | xi = z] dt bounds the
+- `rice`, of rows without noise of their own (a G = 0): int phi(z/s)/s E[(eta - dz/dt)^+ | xi = z] dt bounds the
   probability to be at most z at its start and beyond z on it;
 - `windows`, of rows with noise of their own: Slepian's comparison with an Ornstein-Uhlenbeck process in windows of equal
-  length bounds the same for the levels l s_t;
+  length bounds the same;
 - `crude`, of any row: what is gained on the piece is its own Wiener process and an integral of eta.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from flint import arb
 
@@ -24,12 +26,26 @@ _JOINT = 1_000_000
 _RICE, _CRUDE = 12 * FUNCTION, 24 * FUNCTION
 _SHARES = (0.5, 0.8, 0.95, 0.99)
 """Parts of a level that what moves most may take of it, the best of which counts."""
-_FAST = arb(2) ** -60
+_SHORTEST = arb(2) ** -60
 """The least clock of a window: one that is longer than it need be is sound."""
+_BEYOND = 1 + arb(2) ** -40
+"""How far a rate of decay is taken beyond the root of what it must satisfy, lest rounding decide."""
 _LONGEST = 4
 """The longest clock of a window that is looked at: far shorter ones say more."""
 _SAFE = 1 - arb(2) ** -30
 """Parts of a level, as floats, add up to no more than the level."""
+
+
+class Level(NamedTuple):
+    """A level above 0 that changes evenly over a piece: exact numbers at its ends."""
+
+    first: arb
+    last: arb
+
+    @property
+    def least(self) -> arb:
+        """The smaller one of both ends."""
+        return arb.min(self.first, self.last)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,86 +75,120 @@ def positive_part(mean: arb, variance: arb) -> arb:
     return arb.max(upper(value), arb(0))
 
 
-def rice(level: arb, piece: Piece, budget: Budget) -> Cost | None:
-    """P(xi is at most z at the start of the piece and beyond z on it), z = ``level`` > 0; None where s may be 0.
+def rice(level: Level, piece: Piece, budget: Budget) -> Cost | None:
+    """P(xi is at most z at the start of the piece and beyond z on it); None where s may be 0.
 
-    With s^2, c and e enclosed: phi(z/s)/s rises in s up to z and falls from there, and the mean of eta^+ rises with the
-    mean c z/s^2 and the variance e - c^2/s^2 of eta.
+    On a path that does so f = xi - z passes from 0 to every small y > 0, so that int f'^+ 1{0 < f < y} dt >= y: by
+    Fatou's lemma the probability is at most int phi(z/s)/s E[(eta - z')^+ | xi = z] dt. With s^2, c and e enclosed:
+    phi(z/s)/s falls in z, rises in s up to z and falls from there, and the mean of (eta - z')^+ rises with the mean c
+    z/s^2 - z' and the variance e - c^2/s^2.
     """
     if not (piece.s_low > 0 and piece.s_high.is_finite() and piece.e_high.is_finite()):
         return None
     budget.balls(1, _RICE)
-    square = level * level
+    low, high = level.least, arb.max(*level)
+    square = low * low
     if piece.s_high <= square:
-        most = density(level, piece.s_high)
+        most = density(low, piece.s_high)
     elif piece.s_low >= square:
-        most = density(level, piece.s_low)
+        most = density(low, piece.s_low)
     else:
-        most = arb(-0.5).exp() / ((2 * arb.pi()).sqrt() * level)
-    mean = upper(piece.c_high * level / (piece.s_low if piece.c_high > 0 else piece.s_high))
+        most = arb(-0.5).exp() / ((2 * arb.pi()).sqrt() * low)
+    mean = piece.c_high * (high / piece.s_low if piece.c_high > 0 else low / piece.s_high)
+    mean = upper(mean - (level.last - level.first) / piece.length)
     least = arb.max(arb.max(piece.c_low, -piece.c_high), arb(0))
     rest = upper(arb.max(piece.e_high - least * least / piece.s_high, arb(0)))
     found = upper(piece.length * most * positive_part(mean, rest))
-    return Cost(probability=found, enters=_below(level, piece.first_high), leaves=_above(level, piece.last_low))
+    return Cost(
+        probability=found, enters=_below(level.first, piece.first_high), leaves=_above(level.last, piece.last_low)
+    )
 
 
-def windows(level: arb, piece: Piece, own: arb, count: int, budget: Budget) -> Cost | None:
-    """The same in so many windows of equal length of a row with noise of its own, ``own`` an upper bound of a G G^T a^T.
+def windows(level: Level, piece: Piece, own: arb, count: int, budget: Budget) -> Cost | None:
+    """The same of a row with noise of its own, ``own`` an upper bound of a G G^T a^T, in so many windows.
 
-    For s < t = s + x in a window of length d let g = a F(x) V_s a^T, w = dg/dx. w lies within d sqrt(b s^2) of c_s, and
-    log corr(s, t) has the slope w/g - (c_t + own/2)/s_t^2 in x, which is at least -k. By Slepian's lemma xi/s exceeds
-    l = z/sup s on a window, from below l at its start, no oftener than an Ornstein-Uhlenbeck process of rate k. None
-    where that says nothing.
+    In each xi/s is compared with a stationary Ornstein-Uhlenbeck process U (Slepian's lemma). Of several windows the
+    level over s is taken to be the least of the piece; a single one knows both at its start, and that log s grows at a
+    rate of at most ``_Rates.spread``, while z lies above an exponential between its ends, which is convex. None where
+    that says nothing.
     """
-    if not (piece.s_low > 0 and piece.s_high.is_finite() and piece.b_high.is_finite()):
+    if not (piece.s_low > 0 and piece.s_high.is_finite() and piece.v_high.is_finite()):
         return None
     budget.balls(1, _RICE)
     length = upper(piece.length / count)
-    bend = upper(length * (piece.b_high * piece.s_high).sqrt())
-    lowest, highest = (piece.c_low - bend).lower(), (piece.c_high + bend).upper()
-    least = (piece.s_low + length * arb.min(lowest, arb(0))).lower()
-    most = (piece.s_high + length * arb.max(highest, arb(0))).upper()
-    if not (least > 0 and most.is_finite()):
+    rates = _rates(piece, own, length)
+    clock = upper(arb.max(rates.decay * length, _SHORTEST))
+    if not clock < _LONGEST:
         return None
-    fall = -lowest / (least if lowest < 0 else most)
+    if count > 1:
+        scaled = _below(level.least, piece.s_high)
+        found = upper(count * crossing(scaled, scaled, clock, budget))
+        return Cost(probability=found, enters=scaled, leaves=scaled)
+    scaled = _below(level.first, piece.first_high)
+    falls = upper(rates.spread * length + arb.max(upper((level.first / level.last).log()), arb(0)))
+    end = (scaled * (-falls).exp()).lower()
+    found = crossing(scaled, end, arb.max(clock, falls), budget)
+    return Cost(probability=found, enters=scaled, leaves=_above(level.last, piece.last_low))
+
+
+class _Rates(NamedTuple):
+    """k with corr(xi_s, xi_t) >= exp(-k (t - s)) on a window, and D >= 0 with s_t <= s_s exp(D (t - s)), D <= k."""
+
+    decay: arb
+    spread: arb
+
+
+def _rates(piece: Piece, own: arb, length: arb) -> _Rates:
+    """Rates over windows of a length L on a piece, upper bounds.
+
+    For s < t = s + x let g = a F(x) V_s a^T. By Taylor's formula and |a A^3 F(y) V_s a^T| <= sd(a A^3 Z_(s+y)) s_s,
+    g/s_s^2 >= 1 - p x + q x^2/2 - r x^3/6 with p >= -c/s^2, q <= d/s^2 and r >= sd(a A^3 Z)/s on the piece. That is at
+    least exp(-k x), which is at most 1 - k x + k^2 x^2/2, where k >= 0 and k - p >= L max(k^2 - q, 0)/2 + r L^2/6. And
+    corr = (g/s_s^2)(s_s/s_t), where log s has the slope (c + own/2)/s^2.
+    """
+    p = upper(-piece.c_low / (piece.s_low if piece.c_low < 0 else piece.s_high))
+    q = (piece.d_low / (piece.s_high if piece.d_low > 0 else piece.s_low)).lower()
+    rest = upper((piece.v_high / piece.s_low).sqrt() * length * length / 6)
+    # the least root of k - p - rest = L (k^2 - q)/2, or p + rest where k^2 <= q; what is found is proved below
+    part = 2 * length * (p + rest - length * q / 2)
+    root = part / length / (1 + (1 - part).sqrt()) if part < 1 else arb.pos_inf()
+    k = arb.max(arb.max(upper(root * _BEYOND), upper(p + rest)), arb(0))
+    if not k >= p + rest + length * arb.max(k * k - q, arb(0)) / 2:
+        return _Rates(decay=arb.pos_inf(), spread=arb(0))
     grown = upper(piece.c_high + own / 2)
-    fall += grown / (piece.s_low if grown > 0 else piece.s_high)
-    clock = upper(arb.max(upper(fall * length), _FAST))
-    scaled = _below(level, piece.s_high)
-    if not (clock < _LONGEST and scaled > 0 and scaled.is_finite()):
-        return None
-    found = upper(count * ornstein_uhlenbeck(scaled, clock, budget))
-    return Cost(probability=found, enters=scaled, leaves=scaled)
+    spread = upper(grown / (piece.s_low if grown > 0 else piece.s_high))
+    return _Rates(decay=upper(k + spread), spread=arb.max(spread, arb(0)))
 
 
-def ornstein_uhlenbeck(level: arb, clock: arb, budget: Budget) -> arb:
-    """Upper bound of P(U_0 <= l and U exceeds l within the clock), corr(U_s, U_t) = exp(-|t - s|), l > 0 exact.
+def crossing(first: arb, last: arb, clock: arb, budget: Budget) -> arb:
+    """Upper bound of P(U_0 <= l and U exceeds l exp(-D x), 0 <= x <= L) for l = ``first`` > 0, ``last`` = l exp(-D L).
 
-    U_t = W(u)/sqrt(u) at u = exp(2 t), and l sqrt(u) lies above its chord L(u) = l + beta (u - 1) on [1, U],
-    beta = l/(sqrt(U) + 1). Of a Wiener process, P(W_1 <= l, W exceeds L on [1, U]) is, by the reflection principle,
-    P(N <= l, Y > l) + exp(2 beta^2 - 2 beta l) P(N <= l - 2 beta, Y > (2 l - 2 beta - l sqrt(U))/sqrt(U)) with standard
-    normal N and Y of correlation 1/sqrt(U).
+    Numbers are exact, corr(U at x, U at y) = exp(-k |x - y|), ``clock`` = k L, and 0 <= D <= k. U = W(u)/sqrt(u) at
+    u = exp(2 k x) with a Wiener process W, and l u^((1 - D/k)/2) is concave, so that it lies above its chord L(u) = l +
+    beta (u - 1) on [1, E], E = exp(2 k L), which ends at last sqrt(E). By the reflection principle W_1 <= l, and W
+    exceeds L on [1, E], with probability P(N <= l, Y > last) + exp(2 beta^2 - 2 beta l) P(N <= l - 2 beta, Y > (l -
+    2 beta - beta (E - 1))/sqrt(E)), N and Y standard normal with correlation 1/sqrt(E).
     """
     budget.balls(1, 2 * _JOINT)
     root = clock.exp()
-    slope = level / (root + 1)
-    start = level - 2 * slope
-    direct = below_and_above(level, level, 1 / root)
-    turned = below_and_above(start, (start + level) / root - level, 1 / root)
-    return upper(direct + (2 * slope * slope - 2 * slope * level).exp() * turned)
+    slope = (last * root - first) / (root * root - 1)
+    direct = below_and_above(first, last, 1 / root)
+    start = first - 2 * slope
+    turned = below_and_above(start, (start - slope * (root * root - 1)) / root, 1 / root)
+    return upper(direct + (2 * slope * slope - 2 * slope * first).exp() * turned)
 
 
-def crude(level: arb, piece: Piece, own: arb, budget: Budget) -> Cost:
-    """P(xi exceeds z on the piece), from anywhere: with parts of z for what it was, its own noise, and int |eta|.
+def crude(level: Level, piece: Piece, own: arb, budget: Budget) -> Cost:
+    """P(xi exceeds the least z on the piece), from anywhere: parts of z for what it was, its own noise, and int |eta|.
 
     sup a G W exceeds y with probability 2 Q(y/sqrt(own h)), by reflection; the mean of |eta| over the piece has
     E exp(l .) <= 2 exp(l^2 e/2), by Jensen's inequality, so that int |eta| exceeds y with probability at most
     2 exp(-y^2/(2 h^2 e)).
     """
     budget.balls(1, _CRUDE)
-    best = arb(1)
+    best, least = arb(1), level.least
     for shares in _shares(piece.first_high.is_zero(), own.is_zero()):
-        before, noise, rest = (arb(share) * level * _SAFE for share in shares)
+        before, noise, rest = (arb(share) * least * _SAFE for share in shares)
         total = arb(0)
         if not piece.first_high.is_zero():
             total += tail(before / piece.first_high.sqrt())
@@ -147,7 +197,7 @@ def crude(level: arb, piece: Piece, own: arb, budget: Budget) -> Cost:
         if not piece.e_high.is_zero():
             total += 2 * (-rest * rest / (2 * piece.length * piece.length * piece.e_high)).exp()
         best = arb.min(best, upper(total))
-    return Cost(probability=best, enters=None, leaves=_above(level, piece.last_low))
+    return Cost(probability=best, enters=None, leaves=_above(least, piece.last_low))
 
 
 def _shares(rests: bool, smooth: bool) -> list[tuple[float, float, float]]:

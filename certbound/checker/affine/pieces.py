@@ -1,12 +1,13 @@
 """What of the law one row needs over pieces of time that are halves of halves of the horizon.
 
-For a row a let r_t = a F(t), xi = a Z and eta = a A Z, with s^2 = Var xi, c = cov(xi, eta), e = Var eta and b = Var(a
-A^2 Z). From the start of a piece on V changes by D+ - D-, where 0 <= D+-(t) <= D+-(h), so that ("Enclosures over a
-piece" in docs/theory.md, section 9)
+For a row a let r_t = a F(t), xi = a Z and eta = a A Z, with s^2 = Var xi, c = cov(xi, eta), e = Var eta, d = cov(xi, a
+A^2 Z) and v = Var(a A^3 Z). From the start of a piece on V changes by D+ - D-, where 0 <= D+-(t) <= D+-(h), so that
+("Enclosures over a piece" in docs/theory.md, section 9)
 
 - a variance x V x^T lies within x D-(h) x^T below and x D+(h) x^T above its first value, and, seen from the end of the
   piece, within x D+(h) x^T below and x D-(h) x^T above its last one;
-- c lies within half of the sum over both signs of the root of (r D r^T)(r A D (r A)^T) of the mean of its ends;
+- c lies within half of the sum over both signs of the root of (r D r^T)(r A D (r A)^T) of the mean of its ends, and d
+  likewise with A^2 in the place of A;
 - the mean u_t = a m + int r v has u'' = r A v, so that u lies within h^(3/2)/sqrt(48) times the root of
   int (r A v)^2 of its chord; the same holds for each r_t e_i with r A^2 e_i;
 - disturbances add at most int |r E_j| <= sqrt(h int (r E_j)^2) on the piece.
@@ -44,18 +45,29 @@ class Piece(NamedTuple):
     c_low: arb
     c_high: arb
     e_high: arb
-    b_high: arb
-    mean_high: arb  # of the mean with the worst start and disturbances along the row
-    mean_low: arb  # and of the least one
+    d_low: arb
+    v_high: arb
+    means: Means
 
 
-class _Change(NamedTuple):
-    """What s^2, c, e and b change by over a piece, the part of one sign."""
+class Means(NamedTuple):
+    """The mean along the row over a piece lies between the chords of these bounds, for all starts and disturbances."""
+
+    low_first: arb
+    low_last: arb
+    high_first: arb
+    high_last: arb
+
+
+class _Moments(NamedTuple):
+    """s^2, c, e, d, Var(a A^2 Z) and v: their values, or what they change by over a piece, the part of one sign."""
 
     s: arb
     c: arb
     e: arb
-    b: arb
+    d: arb = _ZERO
+    b: arb = _ZERO
+    v: arb = _ZERO
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,7 +107,7 @@ def sources_of(affine: Affine, gain: arb_mat, loss: arb_mat | None) -> dict[str,
 
 def work_of(pieces: int, states: int, sources: int) -> tuple[int, int, int]:
     """Products of ball matrices by which a row is followed over so many pieces."""
-    return pieces, states, states * (4 + 3 * sources) + 40 * (sources + 2)
+    return pieces, states, states * (5 + 5 * sources) + 50 * (sources + 2)
 
 
 class Follower:
@@ -104,24 +116,27 @@ class Follower:
     def __init__(self, affine: Affine, transitions: Transitions, budget: Budget) -> None:
         self.affine, self.transitions, self.budget = affine, transitions, budget
 
-    def pieces(self, row: Row, leaves: Sequence[Leaf]) -> list[Piece]:
-        """The pieces of a grid, with what is known of a row over each."""
+    def pieces(self, row: Row, leaves: Sequence[Leaf], *, smooth: bool) -> list[Piece]:
+        """The pieces of a grid, with what is known of a row over each; ``smooth``: d and v are not asked for."""
         n, names = len(row), self.transitions.gramians
         self.budget.products(*work_of(len(leaves), n, len(names)))
         self.budget.balls(len(leaves) * 80)
         with self.budget.passing():
             self.budget.hold(len(leaves) * (n + 40))
             rows = self._rows(row, leaves)
-            found: dict[int, list[arb]] = {}
-            changes: dict[int, tuple[_Change, _Change]] = {}
+            found: dict[int, tuple[arb, arb, arb]] = {}
+            changes: dict[int, tuple[_Moments, _Moments]] = {}
             for level in sorted({leaf.level for leaf in leaves}):
                 own = [k for k, leaf in enumerate(leaves) if leaf.level == level]
-                self._level(arb_mat([rows[k] for k in own]), own, level, found, changes)
-            variances = self._variances(row, [changes[k] for k in range(len(leaves))])
+                matrix = arb_mat([rows[k] for k in own])
+                changes |= dict(zip(own, self._changes(matrix, level, smooth)))
+                found |= dict(zip(own, self._errors(matrix, level)))
+            variances = self._variances(row, [changes[k] for k in range(len(leaves))], smooth)
             means = self._means(rows, [found[k] for k in range(len(leaves))])
         self.budget.hold(len(leaves) * 12)
+        finest = max(leaf.level for leaf in leaves)
         return [
-            self._piece(leaf, leaves, changes[k], (variances[k], variances[k + 1]), means[k])
+            self._piece(leaf, finest, changes[k], (variances[k], variances[k + 1]), means[k])
             for k, leaf in enumerate(leaves)
         ]
 
@@ -141,64 +156,60 @@ class Follower:
         last = (arb_mat([row]) * self.transitions.transitions[0]).entries()
         return [*(known[leaf.place] for leaf in leaves), last]
 
-    def _level(
-        self, rows: arb_mat, own: list[int], level: int, found: dict[int, list[arb]],
-        changes: dict[int, tuple[_Change, _Change]],
-    ) -> None:  # fmt: skip
-        """What is known over pieces of one level: changes of variances, and errors and steps of the mean."""
-        gramians, slope, h = self.transitions.gramians, self.affine.slope, self.transitions.step(level)
-        moved = rows * slope
-        again = moved * slope
-        both = []
-        for name in (GAIN, LOSS):
-            if name in gramians:
-                gramian = gramians[name][level]
-                images = _lists(rows * gramian)
-                speeds = _squares(moved, gramian)
-                crosses = [_dot(image, q) for image, q in zip(images, _lists(moved))]
-                sizes = [_square(_dot(image, r)) for image, r in zip(images, _lists(rows))]
-                both.append([_Change(*one) for one in zip(sizes, crosses, speeds, _squares(again, gramian))])
-            else:
-                both.append([_Change(_ZERO, _ZERO, _ZERO, _ZERO)] * len(own))
-        chord = (h * h * h / 48).sqrt()
-        errors = [_ZERO] * len(own)
-        starts = len([x for x in self.affine.radius.entries() if not x.is_zero()])
-        for name, factor in ((MEAN, chord), (WIDE, chord * arb(starts).sqrt())):
-            if name in gramians:
-                squares = _squares(rows, gramians[name][level])
-                errors = [error + factor * _root(square) for error, square in zip(errors, squares)]
-        pushed = [_ZERO] * len(own)
-        for name in gramians:
-            if name.startswith(PUSH):
-                squares = _squares(rows, gramians[name][level])
-                pushed = [push + h.sqrt() * _root(square) for push, square in zip(pushed, squares)]
-        drifts = self.transitions.drifts
-        steps = (rows * drifts[level]).entries() if drifts else [_ZERO] * len(own)
-        for i, k in enumerate(own):
-            found[k] = [steps[i], errors[i], pushed[i]]
-            changes[k] = both[0][i], both[1][i]
+    def _changes(self, rows: arb_mat, level: int, smooth: bool) -> list[tuple[_Moments, _Moments]]:
+        """What the moments gain and lose over pieces of one level."""
+        gramians, nothing = self.transitions.gramians, [_Moments(_ZERO, _ZERO, _ZERO)] * rows.nrows()
+        both = [
+            self._moments(rows, gramians[name][level], smooth) if name in gramians else nothing
+            for name in (GAIN, LOSS)
+        ]
+        return list(zip(*both))
 
-    def _variances(self, row: Row, changes: Sequence[tuple[_Change, _Change]]) -> list[_Change]:
-        """s^2, c, e and b at the ends of the pieces."""
-        covariance = self.affine.covariance
-        at = _Change(_ZERO, _ZERO, _ZERO, _ZERO)
+    def _moments(self, rows: arb_mat, form: arb_mat, smooth: bool) -> list[_Moments]:
+        """The moments of rows under a covariance."""
+        slope = self.affine.slope
+        moved = rows * slope
+        images, own, first = _lists(rows * form), _lists(rows), _lists(moved)
+        found = [
+            [_square(_dot(image, r)) for image, r in zip(images, own)],
+            [_dot(image, q) for image, q in zip(images, first)], _squares(moved, form),
+        ]  # fmt: skip
+        if not smooth:
+            again = moved * slope
+            found.append([_dot(image, q) for image, q in zip(images, _lists(again))])
+            found += [_squares(again, form), _squares(again * slope, form)]
+        return [_Moments(*one) for one in zip(*found)]
+
+    def _errors(self, rows: arb_mat, level: int) -> list[tuple[arb, arb, arb]]:
+        """Over pieces of one level: the mean's step, how far it is from its chord, and what disturbances add."""
+        gramians, h = self.transitions.gramians, self.transitions.step(level)
+        errors, pushed = [_ZERO] * rows.nrows(), [_ZERO] * rows.nrows()
+        starts = len([x for x in self.affine.radius.entries() if not x.is_zero()])
+        for name, found in gramians.items():
+            if name in (MEAN, WIDE):
+                factor = (h * h * h * (starts if name == WIDE else 1) / 48).sqrt()
+                errors = [e + factor * _root(square) for e, square in zip(errors, _squares(rows, found[level]))]
+            elif name.startswith(PUSH):
+                pushed = [e + h.sqrt() * _root(square) for e, square in zip(pushed, _squares(rows, found[level]))]
+        drifts = self.transitions.drifts
+        steps = (rows * drifts[level]).entries() if drifts else [_ZERO] * rows.nrows()
+        return list(zip(steps, errors, pushed))
+
+    def _variances(
+        self, row: Row, changes: Sequence[tuple[_Moments, _Moments]], smooth: bool
+    ) -> list[_Moments]:  # fmt: skip
+        """The moments at the ends of the pieces."""
+        covariance, at = self.affine.covariance, _Moments(_ZERO, _ZERO, _ZERO)
         if covariance is not None:
-            flat = arb_mat([row])
-            moved = flat * self.affine.slope
-            again = moved * self.affine.slope
-            image = (flat * covariance).entries()
-            at = _Change(
-                _square(_dot(image, row)), _dot(image, moved.entries()), _squares(moved, covariance)[0],
-                _squares(again, covariance)[0],
-            )  # fmt: skip
+            at = self._moments(arb_mat([row]), covariance, smooth)[0]
         found = [at]
         for gain, loss in changes:
-            at = _Change(*(now + more - less for now, more, less in zip(at, gain, loss)))
+            at = _Moments(*(now + more - less for now, more, less in zip(at, gain, loss)))
             found.append(at)
         return found
 
-    def _means(self, rows: Sequence[Row], found: Sequence[Sequence[arb]]) -> list[tuple[arb, arb]]:
-        """The least and the largest mean along the row over every piece, with all starts and disturbances."""
+    def _means(self, rows: Sequence[Row], found: Sequence[Sequence[arb]]) -> list[Means]:
+        """Bounds of the mean along the row over every piece."""
         middle, radius = self.affine.middle.entries(), self.affine.radius.entries()
         at, pushed = _dot(rows[0], middle), _ZERO
         spread = [sum((abs(x) * y for x, y in zip(row, radius) if not y.is_zero()), _ZERO) for row in rows]
@@ -206,23 +217,22 @@ class Follower:
         for k, (step, error, push) in enumerate(found):
             pushed = pushed + push
             more = upper(error + pushed)
-            ends = ((at, spread[k]), (at + step, spread[k + 1]))
-            high = arb.max(*(upper(u + w) for u, w in ends)) + more
-            low = arb.max(*(upper(w - u) for u, w in ends)) + more
-            result.append((-upper(low), upper(high)))
+            ends = ((at, spread[k] + more), (at + step, spread[k + 1] + more))
+            result.append(Means(*(-upper(w - u) for u, w in ends), *(upper(u + w) for u, w in ends)))
             at = at + step
         return result
 
     def _piece(
-        self, leaf: Leaf, leaves: Sequence[Leaf], change: tuple[_Change, _Change], ends: tuple[_Change, _Change],
-        mean: tuple[arb, arb],
+        self, leaf: Leaf, finest: int, change: tuple[_Moments, _Moments], ends: tuple[_Moments, _Moments],
+        means: Means,
     ) -> Piece:  # fmt: skip
         gain, loss = change
         first, last = ends
         bend = (_root(gain.s * gain.e) + _root(loss.s * loss.e)) / 2
+        twice = (_root(gain.s * gain.b) + _root(loss.s * loss.b)) / 2
         cross = (first.c + last.c) / 2
         whole = Fraction(float(self.transitions.horizon))
-        start = Fraction(leaf.place, 1 << max(one.level for one in leaves))
+        start = Fraction(leaf.place, 1 << finest)
         return Piece(
             start=whole * start, end=whole * (start + Fraction(1, 1 << leaf.level)),
             length=self.transitions.step(leaf.level), first_high=_most(first.s), last_low=_least(last.s),
@@ -230,7 +240,8 @@ class Follower:
             s_high=arb.min(_most(first.s + gain.s), _most(last.s + loss.s)),
             c_low=-upper(bend - cross), c_high=upper(bend + cross),
             e_high=arb.min(_most(first.e + gain.e), _most(last.e + loss.e)),
-            b_high=arb.min(_most(first.b + gain.b), _most(last.b + loss.b)), mean_low=mean[0], mean_high=mean[1],
+            d_low=-upper(twice - (first.d + last.d) / 2), v_high=arb.min(_most(first.v + gain.v), _most(last.v + loss.v)),
+            means=means,
         )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """The proof by the exact law of an affine model (docs/theory.md, section 9, "Affine models exactly").
 
 The file proposes pieces of time and, for rows with noise of their own, numbers of windows; the law is the checker's
-own, from the problem alone. A row's limit z_t is what the worst mean leaves on a piece. With a path that first exceeds
+own, from the problem alone. What the worst mean leaves of a limit on a piece is a level z_t that changes evenly. With a path that first exceeds
 a limit in some piece one of these comes about, and their probabilities are added up:
 
 - it is beyond the level of the first piece that is asked at its start;
@@ -21,7 +21,7 @@ from typing import NamedTuple
 from flint import arb, arb_mat, ctx
 
 from certbound.checker.affine.coefficients import Affine, Limit, affine_of, limits_of, split_source
-from certbound.checker.affine.crossings import Cost, crude, rice, windows
+from certbound.checker.affine.crossings import Cost, Level, crude, rice, windows
 from certbound.checker.affine.pieces import Follower, Leaf, Piece, leaves_of, sources_of, work_of
 from certbound.checker.affine.transitions import MOST_LEVELS, Transitions
 from certbound.checker.balls import matrix, tail, upper
@@ -128,7 +128,7 @@ class _Law:
         finest = max(leaf.level for leaves in grids for leaf in leaves)
         self.transitions = Transitions(affine.slope, sources, drift, horizon, finest, budget)
         self.follower = Follower(affine, self.transitions, budget)
-        self._known: dict[tuple[int, tuple[str, ...]], list[Piece]] = {}
+        self._known: dict[tuple[int, bool, tuple[str, ...]], list[Piece]] = {}
 
     def work(self, grid: int) -> int:
         """Units of work of following a row over a grid."""
@@ -137,7 +137,7 @@ class _Law:
 
     def cost(self, limit: Limit, plan: Plan, number: int) -> arb:
         """Upper bound of P(row . X exceeds the bound while that is asked)."""
-        pieces, sign = self._followed(limit, plan.grid)
+        pieces, sign = self._followed(limit, plan)
         with ctx.workprec(_BITS):
             own = upper(sum((x * x for x in (arb_mat([limit.row]) * self.affine.diffusion).entries()), arb(0)))
             if own.is_zero() != (plan.windows is None):
@@ -147,10 +147,7 @@ class _Law:
             costs = []
             for k in kept:
                 self.budget.check()
-                high = pieces[k].mean_high if sign > 0 else -pieces[k].mean_low
-                level = (limit.bound - high).lower()
-                if not level > 0:
-                    raise Unproved(f"nothing is left for the noise by \"{limit.label}\"")
+                level = _level(limit, sign, pieces[k])
                 count = None if plan.windows is None else plan.windows[k]
                 costs.append(_least(level, pieces[k], own, count, self.budget))
             found = _chained(costs)
@@ -158,16 +155,17 @@ class _Law:
             raise Unproved(f"nothing is left for the noise by \"{limit.label}\"")
         return found
 
-    def _followed(self, limit: Limit, grid: int) -> tuple[list[Piece], int]:
+    def _followed(self, limit: Limit, plan: Plan) -> tuple[list[Piece], int]:
         """The pieces of the row or of its opposite, followed once, and whose they are (1 or -1)."""
         self.budget.balls(2 * len(limit.row))
         first = next((x for x in limit.row if not x.is_zero()), arb(1))
         sign = 1 if first > 0 else -1
         row = [sign * x + arb(0) for x in limit.row]
         # exact numbers are told apart by all their digits
-        key = grid, tuple("" if x.is_zero() else str(x.man_exp()) for x in row)
+        grid, smooth = plan.grid, plan.windows is None
+        key = grid, smooth, tuple("" if x.is_zero() else str(x.man_exp()) for x in row)
         if key not in self._known:
-            self._known[key] = self.follower.pieces(row, self.grids[grid])
+            self._known[key] = self.follower.pieces(row, self.grids[grid], smooth=smooth)
         return self._known[key], sign
 
 
@@ -176,10 +174,23 @@ def _meets(piece: Piece, during: tuple[float, float] | None) -> bool:
     return during is None or (piece.end >= Fraction(during[0]) and piece.start <= Fraction(during[1]))
 
 
-def _least(level: arb, piece: Piece, own: arb, count: int | None, budget: Budget) -> Cost:
+def _level(limit: Limit, sign: int, piece: Piece) -> Level:
+    """What the worst mean leaves of a limit on a piece."""
+    low_first, low_last, high_first, high_last = piece.means
+    ends = (high_first, high_last) if sign > 0 else (-low_first, -low_last)
+    first, last = ((limit.bound - end).lower() for end in ends)
+    if not (first > 0 and last > 0):
+        raise Unproved(f"nothing is left for the noise by \"{limit.label}\"")
+    return Level(first=first, last=last)
+
+
+def _least(level: Level, piece: Piece, own: arb, count: int | None, budget: Budget) -> Cost:
     """The smaller one of what crossings cost and of what is sure from any start."""
     plain = crude(level, piece, own, budget)
-    found = rice(level, piece, budget) if count is None else windows(level, piece, own, count, budget)
+    if count is None:
+        found = rice(level, piece, budget)
+    else:
+        found = windows(level, piece, own, count, budget)
     return plain if found is None or plain.probability <= found.probability else found
 
 
