@@ -21,9 +21,6 @@ from certbound.problem.model import Tape
 _SLACK = arb(2) ** -38
 """Part of a variance by which reading a start's covariance may have raised it (`statement.problem`), and more."""
 
-Row = list[arb]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Affine:
     """dX = (A X + c + E d) dt + G dW from X_0 = m + e + N, in balls that hold the exact numbers.
@@ -59,7 +56,7 @@ class Limit:
     """row . X <= bound, at all times or ``during`` a window of time."""
 
     label: str
-    row: Row
+    row: list[float]
     bound: arb
     during: tuple[float, float] | None
 
@@ -146,9 +143,11 @@ def _faces(constraint: Constraint, n: int, budget: Budget) -> list[Limit]:
     sign = 1 if constraint.inside else -1  # an obstacle a x <= b is kept off where -a x <= -b
     found = []
     for number, bound in enumerate(region.bounds):
-        face = region.face(number)
-        offset = arb(bound) + sum((a * arb(x) for a, x in zip(face, region.center)), arb(0))
-        row = region.lift([sign * a for a in face], n)
+        face = region.faces[number]
+        offset = arb(bound) + sum((arb(a) * arb(x) for a, x in zip(face, region.center)), arb(0))
+        row = [0.0] * n
+        for place, value in zip(region.coordinates, face):
+            row[place] = sign * value
         found.append(Limit(label=constraint.label, row=row, bound=sign * offset, during=constraint.during))
     return found
 

@@ -22,13 +22,14 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from certbound.checker.affine.coefficients import Affine, Row
+from certbound.checker.affine.coefficients import Affine
 from certbound.checker.affine.transitions import Transitions
 from certbound.checker.balls import column, diagonal, upper
 from certbound.checker.report import Budget
 
 GAIN, LOSS, MEAN, WIDE, PUSH = "gain", "loss", "mean", "wide", "push"
 
+Row = list[arb]
 _ZERO = arb(0)
 
 

@@ -22,11 +22,11 @@ from flint import arb, arb_mat, ctx
 
 from certbound.checker.affine.coefficients import Affine, Limit, affine_of, limits_of, split_source
 from certbound.checker.affine.crossings import Cost, Level, crude, rice, windows
-from certbound.checker.affine.pieces import Follower, Leaf, Piece, leaves_of, sources_of, work_of
+from certbound.checker.affine.pieces import Follower, Leaf, Piece, leaves_of, sources_of
 from certbound.checker.affine.transitions import MOST_LEVELS, Transitions
 from certbound.checker.balls import matrix, tail, upper
 from certbound.checker.reading import Record, wholes
-from certbound.checker.report import PRODUCT, Budget, Unproved
+from certbound.checker.report import Budget, Unproved
 from certbound.checker.statement import Model
 from certbound.errors import CertificateError
 
@@ -69,7 +69,6 @@ def check_affine(model: Model, value: object, budget: Budget) -> arb:
         affine = affine_of(model, budget)
         gain, loss = split_source(affine, _loss(record, model.dimension), budget)
         law = _Law(affine, gain, loss, model.horizon, grids, budget)
-        budget.expect(sum(law.work(plan.grid) for plan in plans) // 2)
         total = arb(0)
         for number, (limit, plan) in enumerate(zip(limits, plans)):
             total += law.cost(limit, plan, number)
@@ -109,8 +108,13 @@ def _plans(record: Record, limits: Sequence[Limit], grids: Sequence[Sequence[Lea
 
 
 def _loss(record: Record, n: int) -> arb_mat | None:
-    """L, (n, n), of a normal start."""
-    return None if record["loss"] is None else matrix(record.array("loss", n, n))
+    """L of a normal start, (n, k) with k up to 2 n."""
+    if record["loss"] is None:
+        return None
+    rows = record.array("loss", n, None)
+    if not 1 <= len(rows[0]) <= 2 * n or any(len(row) != len(rows[0]) for row in rows):
+        raise CertificateError(f"`{record.at('loss')}` must hold a matrix of 1 to {2 * n} columns.")
+    return matrix(rows)
 
 
 class _Law:
@@ -128,18 +132,13 @@ class _Law:
         finest = max(leaf.level for leaves in grids for leaf in leaves)
         self.transitions = Transitions(affine.slope, sources, drift, horizon, finest, budget)
         self.follower = Follower(affine, self.transitions, budget)
-        self._known: dict[tuple[int, bool, tuple[str, ...]], list[Piece]] = {}
-
-    def work(self, grid: int) -> int:
-        """Units of work of following a row over a grid."""
-        a, b, c = work_of(len(self.grids[grid]), self.affine.slope.nrows(), len(self.transitions.gramians))
-        return a * b * c * PRODUCT
+        self._known: dict[tuple[int, bool, tuple[float, ...]], list[Piece]] = {}
 
     def cost(self, limit: Limit, plan: Plan, number: int) -> arb:
         """Upper bound of P(row . X exceeds the bound while that is asked)."""
         pieces, sign = self._followed(limit, plan)
         with ctx.workprec(_BITS):
-            own = upper(sum((x * x for x in (arb_mat([limit.row]) * self.affine.diffusion).entries()), arb(0)))
+            own = upper(sum((x * x for x in (arb_mat([[arb(x) for x in limit.row]]) * self.affine.diffusion).entries()), arb(0)))
             if own.is_zero() != (plan.windows is None):
                 words = "must be null: no noise drives" if own.is_zero() else "must be a list: noise itself drives"
                 raise CertificateError(f"`proof.limits[{number}].windows` {words} the row of this limit.")
@@ -158,14 +157,11 @@ class _Law:
     def _followed(self, limit: Limit, plan: Plan) -> tuple[list[Piece], int]:
         """The pieces of the row or of its opposite, followed once, and whose they are (1 or -1)."""
         self.budget.balls(2 * len(limit.row))
-        first = next((x for x in limit.row if not x.is_zero()), arb(1))
-        sign = 1 if first > 0 else -1
-        row = [sign * x + arb(0) for x in limit.row]
-        # exact numbers are told apart by all their digits
-        grid, smooth = plan.grid, plan.windows is None
-        key = grid, smooth, tuple("" if x.is_zero() else str(x.man_exp()) for x in row)
+        sign = 1 if next((x for x in limit.row if x), 1.0) > 0 else -1
+        row, smooth = tuple(sign * x + 0.0 for x in limit.row), plan.windows is None  # without a -0
+        key = plan.grid, smooth, row
         if key not in self._known:
-            self._known[key] = self.follower.pieces(row, self.grids[grid], smooth=smooth)
+            self._known[key] = self.follower.pieces(list(map(arb, row)), self.grids[plan.grid], smooth=smooth)
         return self._known[key], sign
 
 

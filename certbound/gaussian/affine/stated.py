@@ -16,6 +16,7 @@ from flint import arb_mat
 from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.doubling import Doubling
 from certbound.gaussian.affine.law import GAIN, LOSS, MEAN, WIDE, AffineLaw, transposed_square
+from certbound.gaussian.affine.trace import Inaccurate
 from certbound.gaussian.affine.upper import Limit
 from certbound.gaussian.scalar import log_line_crossing, log_tail
 from certbound.rigor.rounding import quiet
@@ -29,6 +30,7 @@ _LONGEST = 3.9  # clock of a window
 _MOST_WINDOWS = 1e9
 _SHARES = (0.5, 0.8, 0.95, 0.99)  # parts of a level, as the checker tries them
 _LEAST = 1e-300
+_ACCURATE = 1e-9  # of a matrix's largest entry, by which its balls may be wide
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,7 +56,10 @@ class Stated:
 
 
 def stated_exits(law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequence[Limit], near: float) -> Stated:
-    """Pieces for every limit, until their enclosures add at most the part ``near`` to what it costs."""
+    """Pieces for every limit, until their enclosures add at most the part ``near`` to what it costs.
+
+    `Inaccurate` where the working precision of balls is too low for the law.
+    """
     loss = None if law.covariance is None else _loss_of(law)
     known = _Floats(law, loss)
     grids, windows, logs = [], [None] * len(limits), [0.0] * len(limits)
@@ -70,7 +75,12 @@ def stated_exits(law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequen
 
 
 def _middle(matrix: arb_mat) -> Array:
-    return np.array([float(x.mid()) for x in matrix.entries()]).reshape(matrix.nrows(), matrix.ncols())
+    """The middles of balls, none of which may be wide against the largest."""
+    entries = matrix.entries()
+    found, radius = (np.array([float(part) for part in parts]) for parts in zip(*((x.mid(), x.rad()) for x in entries)))
+    if not (np.all(np.isfinite(found)) and np.max(radius) <= _ACCURATE * np.max(np.abs(found)) + _LEAST):
+        raise Inaccurate
+    return found.reshape(matrix.nrows(), matrix.ncols())
 
 
 def _loss_of(law: AffineLaw) -> Array:
