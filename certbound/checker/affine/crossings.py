@@ -5,8 +5,8 @@ exactly"). Three of them serve a piece:
 
 - `rice`, of rows without noise of their own (a G = 0): int phi(z/s)/s E[(eta - dz/dt)^+ | xi = z] dt bounds the
   probability to be at most z at its start and beyond z on it;
-- `windows`, of rows with noise of their own: Slepian's comparison with an Ornstein-Uhlenbeck process in windows of equal
-  length bounds the same;
+- `windows`, of rows with noise of their own: Slepian's comparison with an Ornstein-Uhlenbeck process in windows of
+  equal length bounds the same;
 - `crude`, of any row: what is gained on the piece is its own Wiener process and an integral of eta.
 """
 
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from flint import arb
 
-from certbound.checker.affine.pieces import Piece
+from certbound.checker.affine.row_pieces import Piece
 from certbound.checker.balls import below_and_above, tail, upper
 from certbound.checker.report import FUNCTION, Budget
 

@@ -1,8 +1,8 @@
 """The proof by the exact law of an affine model (docs/theory.md, section 9, "Affine models exactly").
 
 The file proposes pieces of time and, for rows with noise of their own, numbers of windows; the law is the checker's
-own, from the problem alone. What the worst mean leaves of a limit on a piece is a level z_t that changes evenly. With a path that first exceeds
-a limit in some piece one of these comes about, and their probabilities are added up:
+own, from the problem alone. What the worst mean leaves of a limit on a piece is a level z_t that changes evenly. With a
+path that first exceeds a limit in some piece one of these comes about, and their probabilities are added up:
 
 - it is beyond the level of the first piece that is asked at its start;
 - it is at most at the level of a piece at its start and exceeds it on the piece (`crossings`);
@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat, ctx
 
-from certbound.checker.affine.coefficients import Affine, Limit, affine_of, limits_of, split_source
+from certbound.checker.affine.affine_limits import Affine, Limit, affine_of, limits_of, split_source
 from certbound.checker.affine.crossings import Cost, Level, crude, rice, windows
-from certbound.checker.affine.pieces import Follower, Leaf, Piece, leaves_of, sources_of
-from certbound.checker.affine.transitions import MOST_LEVELS, Transitions
+from certbound.checker.affine.row_pieces import Follower, Leaf, Piece, leaves_of, sources_of
+from certbound.checker.affine.gramians import MOST_LEVELS, Transitions
 from certbound.checker.balls import matrix, tail, upper
 from certbound.checker.reading import Record, wholes
 from certbound.checker.report import Budget, Unproved
@@ -138,10 +138,10 @@ class _Law:
         """Upper bound of P(row . X exceeds the bound while that is asked)."""
         pieces, sign = self._followed(limit, plan)
         with ctx.workprec(_BITS):
-            own = upper(sum((x * x for x in (arb_mat([[arb(x) for x in limit.row]]) * self.affine.diffusion).entries()), arb(0)))
+            own = self._own(limit.row)
             if own.is_zero() != (plan.windows is None):
-                words = "must be null: no noise drives" if own.is_zero() else "must be a list: noise itself drives"
-                raise CertificateError(f"`proof.limits[{number}].windows` {words} the row of this limit.")
+                words = "must be null: no noise drives" if own.is_zero() else "must be a list: noise drives"
+                raise CertificateError(f"`proof.limits[{number}].windows` {words} the row of this limit itself.")
             kept = [k for k, piece in enumerate(pieces) if _meets(piece, limit.during)]
             costs = []
             for k in kept:
@@ -153,6 +153,13 @@ class _Law:
         if not found < 1:
             raise Unproved(f"nothing is left for the noise by \"{limit.label}\"")
         return found
+
+    def _own(self, row: Sequence[float]) -> arb:
+        """Upper bound of a G G^T a^T; 0 just where that is 0."""
+        diffusion = self.affine.diffusion
+        self.budget.products(2, diffusion.nrows(), diffusion.ncols())
+        image = arb_mat([[arb(x) for x in row]]) * diffusion
+        return upper(sum((x * x for x in image.entries()), arb(0)))
 
     def _followed(self, limit: Limit, plan: Plan) -> tuple[list[Piece], int]:
         """The pieces of the row or of its opposite, followed once, and whose they are (1 or -1)."""
@@ -183,10 +190,7 @@ def _level(limit: Limit, sign: int, piece: Piece) -> Level:
 def _least(level: Level, piece: Piece, own: arb, count: int | None, budget: Budget) -> Cost:
     """The smaller one of what crossings cost and of what is sure from any start."""
     plain = crude(level, piece, own, budget)
-    if count is None:
-        found = rice(level, piece, budget)
-    else:
-        found = windows(level, piece, own, count, budget)
+    found = rice(level, piece, budget) if count is None else windows(level, piece, own, count, budget)
     return plain if found is None or plain.probability <= found.probability else found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from certbound.gaussian.affine.below import bound_exits_below
 from certbound.gaussian.affine.law import AffineLaw
-from certbound.gaussian.affine.stated import Stated, stated_exits
+from certbound.gaussian.affine.stated_pieces import Stated, stated_exits
 from certbound.gaussian.affine.trace import Inaccurate
 from certbound.gaussian.affine.upper import Limit, bound_exits
 

@@ -88,7 +88,8 @@ class AffineLaw:
         middle = np.array([[float(rest[i, j].mid()) for j in range(n)] for i in range(n)])
         scale = np.sqrt(np.maximum(np.abs(middle).max(axis=1), 1e-300))
         values, vectors = np.linalg.eigh(middle / scale / scale[:, None])
-        root = scale[:, None] * vectors * np.sqrt(np.maximum(-values, 0.0) + _RAISED * np.abs(values).max(initial=_NOTHING))
+        raised = np.maximum(-values, 0.0) + _RAISED * np.abs(values).max(initial=_NOTHING)
+        root = scale[:, None] * vectors * np.sqrt(raised)
         columns = arb_mat(root.tolist())
         loss = transposed_square(columns)
         gain = source + loss

@@ -86,7 +86,9 @@ class AffinePieces:
 def affine_pieces(problem: Problem, near: float) -> AffinePieces | None:
     """Pieces whose enclosures add about the part ``near`` to the bound; None where `affine_answer` has none either."""
     model = affine_model(problem)
-    for bits in _BITS if model is not None else ():
+    if model is None:
+        return None
+    for bits in _BITS:
         with ctx.workprec(bits):
             try:
                 stated = stated_exits(model.law(), model.rows, model.limits, near)

@@ -62,7 +62,8 @@ def stated_exits(law: AffineLaw, rows: Sequence[Sequence[float]], limits: Sequen
     """
     loss = None if law.covariance is None else _loss_of(law)
     known = _Floats(law, loss)
-    grids, windows, logs = [], [None] * len(limits), [0.0] * len(limits)
+    windows: list[tuple[int, ...] | None] = [None] * len(limits)
+    grids, logs = [], [0.0] * len(limits)
     for direction, row in enumerate(rows):
         own = [place for place, limit in enumerate(limits) if limit.direction == direction]
         found = _Direction(known, np.asarray(row, dtype=float), [limits[place] for place in own])
@@ -206,9 +207,9 @@ class _Direction:
         self.times = places / 2.0**finest * known.law.horizon
         self.h = known.law.horizon * 0.5 ** levels.astype(float)
         self.rows = self._rows(places[:-1], finest)
-        n, count = len(self.row), len(levels)
+        count = len(levels)
         change = np.zeros((2, 6, count))
-        self.error, push, step = np.zeros(count), np.zeros(count), np.zeros(count)
+        self.error, push = np.zeros(count), np.zeros(count)
         starts = 1 if known.starts is None else known.starts.shape[1]
         for level in np.unique(levels).tolist():
             own = levels == level
@@ -225,7 +226,6 @@ class _Direction:
                     self.error[own] += root * factor * np.sqrt(self.h[own] ** 3 / 48)
                 else:
                     push[own] += np.sqrt(self.h[own] * np.maximum(_form(r, gramian, r), 0.0))
-        assert n == self.rows.shape[1]
         self._enclose(change)
         self.mean = self.rows @ known.mean
         self.wide = np.zeros(count + 1) if known.starts is None else np.abs(self.rows @ known.starts).sum(axis=1)
@@ -371,7 +371,7 @@ class _Direction:
         best = np.ones(len(h))
         for share in _SHARES:
             if self.own == 0:
-                before, noise = np.where(rests, 0.0, share), 0.0
+                before, noise = np.where(rests, 0.0, share), np.zeros(len(h))
                 rest = np.where(rests, 1.0, 1 - share)
             else:
                 before, noise = np.where(rests, 0.0, share), np.where(rests, share, 0.9 * (1 - share))

@@ -22,9 +22,9 @@ from typing import NamedTuple
 
 from flint import arb, arb_mat
 
-from certbound.checker.affine.coefficients import Affine
-from certbound.checker.affine.transitions import Transitions
-from certbound.checker.balls import column, diagonal, upper
+from certbound.checker.affine.affine_limits import Affine
+from certbound.checker.affine.gramians import Transitions
+from certbound.checker.balls import diagonal, upper
 from certbound.checker.report import Budget
 
 GAIN, LOSS, MEAN, WIDE, PUSH = "gain", "loss", "mean", "wide", "push"
@@ -241,8 +241,8 @@ class Follower:
             s_high=arb.min(_most(first.s + gain.s), _most(last.s + loss.s)),
             c_low=-upper(bend - cross), c_high=upper(bend + cross),
             e_high=arb.min(_most(first.e + gain.e), _most(last.e + loss.e)),
-            d_low=-upper(twice - (first.d + last.d) / 2), v_high=arb.min(_most(first.v + gain.v), _most(last.v + loss.v)),
-            means=means,
+            d_low=-upper(twice - (first.d + last.d) / 2),
+            v_high=arb.min(_most(first.v + gain.v), _most(last.v + loss.v)), means=means,
         )  # fmt: skip
 
 

@@ -83,7 +83,8 @@ def affine_of(model: Model, budget: Budget) -> Affine:
     covariance = initial.covariance
     return Affine(
         slope=slope, drift=slope * column(middle) + origin, diffusion=model.noise.constant(),
-        noise=model.noise.covariance(), middle=column(middle), radius=column([arb(0)] * n if covariance is not None else radius),
+        noise=model.noise.covariance(), middle=column(middle),
+        radius=column(radius if covariance is None else [arb(0)] * n),
         pushes=tuple(column(push) for push in pushes if not all(x.is_zero() for x in push)),
         covariance=None if covariance is None else _as_stated(covariance),
     )  # fmt: skip
