@@ -22,8 +22,8 @@ from flint import arb, arb_mat, ctx
 
 from certbound.checker.affine.affine_limits import Affine, Limit, affine_of, limits_of, split_source
 from certbound.checker.affine.crossings import Cost, Level, crude, rice, windows
-from certbound.checker.affine.row_pieces import Follower, Leaf, Piece, leaves_of, sources_of
 from certbound.checker.affine.gramians import MOST_LEVELS, Transitions
+from certbound.checker.affine.row_pieces import Follower, Leaf, Piece, leaves_of, sources_of
 from certbound.checker.balls import matrix, tail, upper
 from certbound.checker.reading import Record, wholes
 from certbound.checker.report import Budget, Unproved
