@@ -23,7 +23,8 @@ from certbound.checker.report import FUNCTION, Budget
 
 _JOINT = 1_000_000
 """Units of work of a joint probability of two normals."""
-_RICE, _CRUDE = 12 * FUNCTION, 24 * FUNCTION
+_RICE, CRUDE = 12 * FUNCTION, 24 * FUNCTION
+"""Units of work of a bound by Rice's formula or of the rates of windows, and of a crude one: 50 and 100 us measured."""
 _SHARES = (0.5, 0.8, 0.95, 0.99)
 """Parts of a level that what moves most may take of it, the best of which counts."""
 _SHORTEST = arb(2) ** -60
@@ -109,14 +110,14 @@ def windows(level: Level, piece: Piece, own: arb, count: int, budget: Budget) ->
 
     In each xi/s is compared with a stationary Ornstein-Uhlenbeck process U (Slepian's lemma). Of several windows the
     level over s is taken to be the least of the piece; a single one knows both at its start, and that log s grows at a
-    rate of at most ``_Rates.spread``, while z lies above an exponential between its ends, which is convex. None where
+    rate of at most ``Rates.spread``, while z lies above an exponential between its ends, which is convex. None where
     that says nothing.
     """
     if not (piece.s_low > 0 and piece.s_high.is_finite() and piece.v_high.is_finite()):
         return None
     budget.balls(1, _RICE)
     length = upper(piece.length / count)
-    rates = _rates(piece, own, length)
+    rates = rates_over(piece, own, length)
     clock = upper(arb.max(rates.decay * length, _SHORTEST))
     if not clock < _LONGEST:
         return None
@@ -131,14 +132,14 @@ def windows(level: Level, piece: Piece, own: arb, count: int, budget: Budget) ->
     return Cost(probability=found, enters=scaled, leaves=_above(level.last, piece.last_low))
 
 
-class _Rates(NamedTuple):
+class Rates(NamedTuple):
     """k with corr(xi_s, xi_t) >= exp(-k (t - s)) on a window, and D >= 0 with s_t <= s_s exp(D (t - s)), D <= k."""
 
     decay: arb
     spread: arb
 
 
-def _rates(piece: Piece, own: arb, length: arb) -> _Rates:
+def rates_over(piece: Piece, own: arb, length: arb) -> Rates:
     """Rates over windows of a length L on a piece, upper bounds.
 
     For s < t = s + x let g = a F(x) V_s a^T. By Taylor's formula and |a A^3 F(y) V_s a^T| <= sd(a A^3 Z_(s+y)) s_s,
@@ -154,10 +155,10 @@ def _rates(piece: Piece, own: arb, length: arb) -> _Rates:
     root = part / length / (1 + (1 - part).sqrt()) if part < 1 else arb.pos_inf()
     k = arb.max(arb.max(upper(root * _BEYOND), upper(p + rest)), arb(0))
     if not k >= p + rest + length * arb.max(k * k - q, arb(0)) / 2:
-        return _Rates(decay=arb.pos_inf(), spread=arb(0))
+        return Rates(decay=arb.pos_inf(), spread=arb(0))
     grown = upper(piece.c_high + own / 2)
     spread = upper(grown / (piece.s_low if grown > 0 else piece.s_high))
-    return _Rates(decay=upper(k + spread), spread=arb.max(spread, arb(0)))
+    return Rates(decay=upper(k + spread), spread=arb.max(spread, arb(0)))
 
 
 def crossing(first: arb, last: arb, clock: arb, budget: Budget) -> arb:
@@ -185,7 +186,7 @@ def crude(level: Level, piece: Piece, own: arb, budget: Budget) -> Cost:
     E exp(l .) <= 2 exp(l^2 e/2), by Jensen's inequality, so that int |eta| exceeds y with probability at most
     2 exp(-y^2/(2 h^2 e)).
     """
-    budget.balls(1, _CRUDE)
+    budget.balls(1, CRUDE)
     best, least = arb(1), level.least
     for shares in _shares(piece.first_high.is_zero(), own.is_zero()):
         before, noise, rest = (arb(share) * least * _SAFE for share in shares)

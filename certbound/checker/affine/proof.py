@@ -21,7 +21,7 @@ from typing import NamedTuple
 from flint import arb, arb_mat, ctx
 
 from certbound.checker.affine.affine_limits import Affine, Limit, affine_of, limits_of, split_source
-from certbound.checker.affine.crossings import Cost, Level, crude, rice, windows
+from certbound.checker.affine.crossings import CRUDE, Cost, Level, crude, rice, windows
 from certbound.checker.affine.gramians import MOST_LEVELS, Transitions
 from certbound.checker.affine.row_pieces import Follower, Leaf, Piece, leaves_of, sources_of
 from certbound.checker.balls import matrix, tail, upper
@@ -66,6 +66,8 @@ def check_affine(model: Model, value: object, budget: Budget) -> arb:
             raise Unproved(f"{len(limits)} limits are too many for this proof")
         grids = _grids(record)
         plans = _plans(record, limits, grids)
+        lasting = [plan for limit, plan in zip(limits, plans) if limit.during is None]
+        budget.expect(sum(len(grids[plan.grid]) for plan in lasting) * CRUDE)
         affine = affine_of(model, budget)
         gain, loss = split_source(affine, _loss(record, model.dimension), budget)
         law = _Law(affine, gain, loss, model.horizon, grids, budget)

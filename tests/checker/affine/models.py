@@ -23,7 +23,7 @@ def linear_problem(
     slope: Any, diffusion: Any, bounds: Sequence[float], *, horizon: float, initial: Any = None, drift: Any = None,
     gain: Any = None, delta: float = 0.1, safe: Any = None,
 ) -> cb.Problem:  # fmt: skip
-    """dX = (A X + c + E d) dt + G dW with |x_i| at most the bounds (infinite: no limit), from 0 where nothing is said."""
+    """dX = (A X + c + E d) dt + G dW with |x_i| at most the bounds (infinite: no limit), from 0 by default."""
     a, n = np.asarray(slope, dtype=float), len(slope)
     c = np.zeros(n) if drift is None else np.asarray(drift, dtype=float)
     e = None if gain is None else np.asarray(gain, dtype=float)

@@ -11,7 +11,7 @@ from flint import arb, arb_mat, ctx
 
 import certbound as cb
 from certbound.checker.affine.affine_limits import affine_of, split_source
-from certbound.checker.affine.crossings import _rates
+from certbound.checker.affine.crossings import rates_over
 from certbound.checker.affine.gramians import Transitions
 from certbound.checker.affine.row_pieces import Follower, Piece, leaves_of, sources_of
 from certbound.checker.balls import matrix
@@ -106,7 +106,7 @@ def test_the_correlation_decays_no_faster_than_is_stated(name: str, row: list[fl
     for piece in pieces[1:]:
         for length in (0.01, 0.05, 0.1):
             with ctx.workprec(128):
-                rates = _rates(piece, arb(own), arb(length))
+                rates = rates_over(piece, arb(own), arb(length))
             if not rates.decay.is_finite():
                 continue
             seen += 1
