@@ -68,3 +68,27 @@ def proved(problem: cb.Problem, proof: Any = None) -> float:
     given = json.loads(json.dumps(law_proof(problem)[0] if proof is None else proof))
     with ctx.workprec(128):
         return float(check_affine(read(problem), given, Budget(60.0)).upper())
+
+
+def two_areas(horizon: float, delta: float) -> cb.Problem:
+    """Two power areas of eleven states: frequencies within 0.2 Hz, under loads that are Ornstein-Uhlenbeck processes.
+
+    Governors (0.2 s) and turbines (0.5 s) answer the frequencies of areas of 20 s, with a tie line between them.
+    """
+
+    def move(x: Any) -> list[Any]:
+        f1, m1, p1, f2, m2, p2, tie, i1, i2, l1, l2 = x
+        u1, u2 = -0.1 * f1 - 0.01 * i1, -0.1 * f2 - 0.01 * i2
+        return [
+            6.0 * (p1 - l1 - tie) - f1 / 20, (-m1 - f1 / 2.4 + u1) / 0.2, (m1 - p1) / 0.5,
+            6.0 * (p2 - l2 + tie) - f2 / 20, (-m2 - f2 / 2.4 + u2) / 0.2, (m2 - p2) / 0.5,
+            0.1 * (f1 - f2), f1, f2, -l1 / 30, -l2 / 30,
+        ]  # fmt: skip
+
+    noise = np.zeros((11, 2))
+    noise[9, 0] = noise[10, 1] = 0.04 * np.sqrt(2 / 30)
+    high = [OPEN] * 11
+    high[0] = high[3] = 0.2
+    safe = [cb.Inside(cb.Box([-x for x in high], high))]
+    system = cb.ContinuousSystem(move, states=11, diffusion=noise)
+    return cb.Problem(system, initial=[0.0] * 11, safe=safe, horizon=horizon, delta=delta)

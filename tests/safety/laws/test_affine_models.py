@@ -45,7 +45,8 @@ def test_a_certificate_states_the_law_where_the_linear_response_proves_too_littl
 
 
 def test_where_the_linear_response_serves_delta_its_own_proof_is_written():
-    problem = areas(20.0, load=0.002)
+    system = cb.ContinuousSystem(lambda x: -x, states=1, diffusion=[[0.2]])
+    problem = cb.Problem(system, initial=[0.0], safe=[cb.Inside(cb.Box([-1.0], [1.0]))], horizon=2.0, delta=0.05)
     verdict = cb.verify_safety(problem, method="linear")
     assert json.loads(certificate_text(problem, verdict))["claim"]["method"] == "linear"
 
