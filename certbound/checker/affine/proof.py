@@ -26,7 +26,7 @@ from certbound.checker.affine.gramians import MOST_LEVELS, Transitions
 from certbound.checker.affine.row_pieces import Follower, Leaf, Piece, leaves_of, sources_of
 from certbound.checker.balls import matrix, tail, upper
 from certbound.checker.reading import Record, wholes
-from certbound.checker.report import Budget, Unproved
+from certbound.checker.report import STEP, Budget, Unproved
 from certbound.checker.statement import Model
 from certbound.errors import CertificateError
 
@@ -37,6 +37,8 @@ MOST_LIMITS = 1_000
 FEWEST_BITS, MOST_BITS = 128, 3_000
 MOST_WINDOWS = 10**9
 """Windows of one piece; their number costs nothing."""
+_LEAF = 200
+"""Bytes of the start of a piece, with the number of its place."""
 _BITS = 128
 """Bits for the probability of a piece: nothing magnifies its balls."""
 
@@ -64,7 +66,7 @@ def check_affine(model: Model, value: object, budget: Budget) -> arb:
         limits = limits_of(model, budget)
         if len(limits) > MOST_LIMITS:
             raise Unproved(f"{len(limits)} limits are too many for this proof")
-        grids = _grids(record)
+        grids = _grids(record, budget)
         plans = _plans(record, limits, grids)
         lasting = [plan for limit, plan in zip(limits, plans) if limit.during is None]
         budget.expect(sum(len(grids[plan.grid]) for plan in lasting) * CRUDE)
@@ -77,13 +79,15 @@ def check_affine(model: Model, value: object, budget: Budget) -> arb:
         return upper(total)
 
 
-def _grids(record: Record) -> list[list[Leaf]]:
+def _grids(record: Record, budget: Budget) -> list[list[Leaf]]:
     found = []
     for index, item in enumerate(record.items("grids", 1, MOST_LIMITS)):
         path = f"{record.at('grids')}[{index}]"
         levels = wholes(item, path, 0, MOST_LEVELS)
         if not levels or len(levels) > MOST_PIECES:
             raise CertificateError(f"`{path}` must have 1 to {MOST_PIECES} entries, got {len(levels)}.")
+        budget.take(_LEAF * len(levels))
+        budget.spend(STEP * len(levels))
         leaves = leaves_of(levels)
         if leaves is None:
             raise CertificateError(

@@ -16,7 +16,6 @@ A^2 Z) and v = Var(a A^3 Z). From the start of a piece on V changes by D+ - D-, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -28,6 +27,9 @@ from certbound.checker.balls import diagonal, upper
 from certbound.checker.report import Budget
 
 GAIN, LOSS, MEAN, WIDE, PUSH = "gain", "loss", "mean", "wide", "push"
+
+_PIECE = 24
+"""Memory of a piece that is kept, in balls: eleven of them, and two times as fractions."""
 
 Row = list[arb]
 _ZERO = arb(0)
@@ -71,8 +73,7 @@ class _Moments(NamedTuple):
     v: arb = _ZERO
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Leaf:
+class Leaf(NamedTuple):
     """The start of a piece in units of the finest step of its grid, and its level."""
 
     place: int
@@ -134,7 +135,7 @@ class Follower:
                 found |= dict(zip(own, self._errors(matrix, level)))
             variances = self._variances(row, [changes[k] for k in range(len(leaves))], smooth)
             means = self._means(rows, [found[k] for k in range(len(leaves))])
-        self.budget.hold(len(leaves) * 12)
+        self.budget.hold(len(leaves) * _PIECE)
         finest = max(leaf.level for leaf in leaves)
         return [
             self._piece(leaf, finest, changes[k], (variances[k], variances[k + 1]), means[k])
