@@ -8,6 +8,8 @@ import pytest
 import certbound as cb
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
+from certbound.gaussian.affine import lagged, upper
+from certbound.reach.affine import affine_answer
 from certbound.safety.certificate import certificate_text, problem_data
 
 
@@ -56,3 +58,19 @@ def test_where_neither_serves_it_is_said_why():
     verdict = cb.verify_safety(problem, method="linear")
     with pytest.raises(CertificateError, match=r"too likely|no probability was bounded"):
         certificate_text(problem, verdict)
+
+
+@pytest.mark.parametrize("rounds", [1, 3])
+def test_where_looks_at_pieces_run_out_every_piece_has_its_costs(rounds, monkeypatch):
+    for module in (lagged, upper):
+        monkeypatch.setattr(module, "_ROUNDS", rounds)
+    assert affine_answer(areas(3000.0)).log10_delta <= 0
+
+
+def test_a_stationary_start_has_an_exact_law():
+    start = cb.GaussianStart([0.0, 0.0], [[0.05, 0.0], [0.0, 0.05]])
+    system = cb.ContinuousSystem(lambda x: [x[1], -x[0] - 0.4 * x[1]], states=2, diffusion=[[0.0], [0.2]])
+    safe = [cb.Inside(cb.Box([-1.5, -np.inf], [1.5, np.inf]))]
+    answer = affine_answer(cb.Problem(system, initial=start, safe=safe, horizon=30.0, delta=0.1))
+    crossings = 2 * 30.0 / (2 * np.pi) * np.exp(-(1.5**2) / 0.1)  # by Rice's formula
+    assert 0.9 * crossings <= 10**answer.log10_delta <= 1.1 * crossings
