@@ -100,7 +100,7 @@ report words
 reading
 balls expressions
 statement
-constants linear barrier values endless time_pieces
+constants linear barrier values endless affine time_pieces
 claims
 check
 """
@@ -131,6 +131,7 @@ MANY_DOORS = {
     "checker.endless": (7, "a proof from above and one from below of each kind, which the table of engines names"),
     "values.continuous": (16, "bounds, rates and charts, and the surfaces that certificates state, with their payment"),
     "values.discrete": (8, "one bound of any horizon more; kernels are those of the steps along the flow too"),
+    "gaussian.affine": (7, "bounds from both sides, and the pieces that a certificate states, with their records"),
     "gaussian.scalar": (20, "a catalogue of bounds of scalar Gaussian events, of which each direction takes its own"),
     "problem.model": (41, "the one description of functions, which every room reads, differentiates and evaluates"),
     "gaussian.response": (21, "events in both times, for noise that depends on the state and not; units; jumps"),
@@ -146,7 +147,7 @@ MANY_DOORS = {
     "constants.enclosures": (8, "enclosures and branch and bound, which barrier and reach use too"),
     "reach.contraction": (11, "the constants certificate restates the scalar equation piece by piece"),
     "problem.adapters": (9, "to and from each library"),
-    "safety.certificates": (9, "a writer an engine, one for each side where it has two, and one of other coordinates"),
+    "safety.certificates": (10, "a writer an engine, for each side where it has two; other coordinates, exact laws"),
     "safety.search": (6, "whom to ask next, and with what effort; and of limits that move, of what problem"),
     "safety.engines": (20, "the engines, and the rooms that their certificates restate"),
     "tubes.paper": (6, "the baselines, and the martingales that users take for processes of their own"),

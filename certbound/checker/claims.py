@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from flint import arb
 
+from certbound.checker.affine import check_affine
 from certbound.checker.barrier import check_barrier
 from certbound.checker.constants import check_constants
 from certbound.checker.endless import (
@@ -397,6 +398,7 @@ def _backward_below(model: Model, proof: object, budget: Budget) -> arb:
 
 ENGINES = {
     "linear": Engine(words="linear response (Thm K7)", prove=check_linear, foresees=_additive, holds=True),
+    "affine": Engine(words="the exact law of a linear model", prove=check_affine, foresees=_additive),
     "constants": Engine(words="contraction constants (Thms K2, K5)", prove=check_constants, assumes=_stated),
     "barrier": Engine(words="a barrier that is the exponential of a polynomial", prove=check_barrier),
     "values": Engine(words="the value function itself (Thm K8)", prove=_values, below=_values_below),

@@ -32,7 +32,7 @@ from certbound.watch import limited_to
 
 FORMAT = "certbound certificate"
 VERSION = 1
-_OTHERS = ("reach", "coordinates", "logarithms", "limits", "lasting", "rate", "drift", "surely")
+_OTHERS = ("reach", "coordinates", "logarithms", "limits", "affine", "lasting", "rate", "drift", "surely")
 """Proofs that are not called as their engine."""
 _ROUNDING = 1e-6  # other versions of the ball arithmetic may round otherwise
 _RESERVED, _RESERVED_BELOW = 30.0, 12.0

@@ -22,6 +22,7 @@ from certbound.safety.certificates import (
     backward_proof_below,
     barrier_proof,
     constants_proof,
+    law_proof,
     of_coordinates,
     quadratic_proof,
     response_proof,
@@ -151,7 +152,7 @@ ENGINES: dict[str, Engine] = {
             when="always; says most where the noise is small against the curvature of the model, and where there are "
             "many states; has lower bounds too, so that it answers UNSAFE",
             prove=by_law(_LINEAR),
-            write=of_laws(of_coordinates(response_proof), _LINEAR),
+            write=of_laws(of_coordinates(response_proof), _LINEAR, law_proof),
             again=True,
             chance=linear_chance,
             below=linear_below,

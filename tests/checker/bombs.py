@@ -785,6 +785,52 @@ def _() -> Data:
     return file(about, response(n, steps, discrete=True, separations=[]))
 
 
+# ---- exact laws ----------------------------------------------------------------------------------------------
+
+
+def law(states: int, grids: list[list[int]], limits: int, windows: list[int] | None, bits: int = 128) -> Data:
+    plans = [{"grid": k % len(grids), "windows": windows} for k in range(limits)]
+    return {"engine": "affine", "bits": bits, "grids": grids, "limits": plans}
+
+
+@bomb("pieces of time of a row of 200 states", MORE)
+def _() -> Data:
+    n, count = 200, 2**16
+    about = problem(n, constraints=[faces(n, 1)], noise={"law": "wiener", "diffusion": [[ONE]] * n})
+    return file(about, law(n, [[16] * count], 1, [1] * count))
+
+
+@bomb("Gramians of 250 states for 160 halvings", MORE)
+def _() -> Data:
+    n = 250
+    noise = {"law": "wiener", "diffusion": [[ONE]] * n}
+    return file(problem(n, noise=noise), law(n, [[160, *range(160, 0, -1)]], 2 * n, [1] * 161))
+
+
+@bomb("Gramians of many disturbances in 3000 bits", MORE)
+def _() -> Data:
+    n, pushes = 40, 300
+    nodes: list[list[Any]] = [["input", 1 + i] for i in range(n)] + [["input", 1 + n + j] for j in range(pushes)]
+    outputs = []
+    for i in range(n):
+        total = i
+        for j in range(pushes):
+            nodes.append(["add", total, n + j])
+            total = len(nodes) - 1
+        outputs.append(total)
+    about = problem(n, pushes=pushes, dynamics={"nodes": nodes, "outputs": outputs})
+    return file(about, law(n, [[0]], 2 * n, [1], bits=3000))
+
+
+@bomb("a thousand limits on a long grid", MORE)
+def _() -> Data:
+    dynamics = {"nodes": [["input", 2], ["input", 1], ["neg", 1]], "outputs": [0, 2]}
+    noise = {"law": "wiener", "diffusion": [[ZERO], [ONE]]}
+    wall = {"kind": "halfspace", "normal": [ONE, ZERO], "bound": hexed(9.0)}
+    walls = [{"kind": "inside", "region": wall, "during": None, "label": ""}] * 1_000
+    return file(problem(2, dynamics=dynamics, noise=noise, constraints=walls), law(2, [[16] * 2**16], 1_000, None))
+
+
 # ---- reading -------------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ import pytest
 from certbound.checker import check_data, parse
 from certbound.errors import CertificateError
 from tests.checker import (  # noqa: F401  # they enter themselves
+    affine_forgeries,
     backward_forgeries,
     entering_forgeries,
     goal_forgeries,

@@ -279,7 +279,7 @@ def lagged_cost(law: AffineLaw, row: Sequence[float], level: float, marks: Seque
     """What first crossings of a level cost from the longest lag on, piece by piece."""
     joint = joint_of(law, row, marks, spans)
     known: dict[tuple[int, int], tuple[float, float]] = {}
-    for _ in range(_ROUNDS):
+    for left in range(_ROUNDS - 1, -1, -1):
         keys = list(zip(joint.levels.tolist(), joint.indices))
         new = [k for k, key in enumerate(keys) if key not in known]
         found = lagged_parts(joint, level, marks, np.array(new, dtype=np.intp))
@@ -296,8 +296,8 @@ def lagged_cost(law: AffineLaw, row: Sequence[float], level: float, marks: Seque
         worst = np.isinf(gaps)
         finite = np.where(worst, 0.0, gaps)
         worst |= (finite > _NEAR * whole / (2 * len(gaps))) & (finite > 0.05 * np.max(finite, initial=0.0))
-        if not np.any(worst):
-            break
+        if not (left and np.any(worst)):
+            break  # what is split after the last look would have no costs
         joint.split(np.flatnonzero(worst))
     long = max(mark.lag for mark in marks)
     times = [float(joint.law.doubling.step(int(k)) * index) for k, index in zip(joint.levels, joint.indices)]

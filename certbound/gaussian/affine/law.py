@@ -20,6 +20,7 @@ from certbound.rigor.balls import lower, upper
 
 GAIN, LOSS, MEAN, WIDE = "gain", "loss", "mean", "wide"
 _RAISED = 2.0**-40  # of the largest entry, by which both parts of an indefinite source are raised
+_NOTHING = 1.0  # the largest entry, in its own units, of what is 0: a stationary start's variance does not change
 
 
 def transposed_square(columns: arb_mat) -> arb_mat:
@@ -87,7 +88,8 @@ class AffineLaw:
         middle = np.array([[float(rest[i, j].mid()) for j in range(n)] for i in range(n)])
         scale = np.sqrt(np.maximum(np.abs(middle).max(axis=1), 1e-300))
         values, vectors = np.linalg.eigh(middle / scale / scale[:, None])
-        root = scale[:, None] * vectors * np.sqrt(np.maximum(-values, 0.0) + _RAISED * np.abs(values).max(initial=0.0))
+        raised = np.maximum(-values, 0.0) + _RAISED * np.abs(values).max(initial=_NOTHING)
+        root = scale[:, None] * vectors * np.sqrt(raised)
         columns = arb_mat(root.tolist())
         loss = transposed_square(columns)
         gain = source + loss
@@ -111,13 +113,19 @@ class AffineLaw:
         sources = {GAIN: gain}
         if loss is not None:
             sources[LOSS] = loss
+        return Doubling(self.slope, sources | self.pushing, self.horizon)
+
+    @property
+    def pushing(self) -> dict[str, arb_mat]:
+        """Sources of the Gramians that bound the mean, the starts and the disturbances."""
+        sources = {}
         if not self.still:
             sources[MEAN] = transposed_square(self.mean)
         if self.starts is not None:
             sources[WIDE] = transposed_square(self.starts)
         for place, push in enumerate(self.disturbances):
             sources[f"push{place}"] = transposed_square(push)
-        return Doubling(self.slope, sources, self.horizon)
+        return sources
 
 
 def is_semidefinite(matrix: arb_mat, scale: Array) -> bool:

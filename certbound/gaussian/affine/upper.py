@@ -118,7 +118,7 @@ class Exit:
 
     def _refine(self) -> None:
         unknown, rounds = 0, 0  # pieces of which nothing is known, and since when there are no fewer
-        for _ in range(_ROUNDS):
+        for left in range(_ROUNDS - 1, -1, -1):
             poll("pieces of time")
             self.parts, gaps = self._evaluate()
             rounds = rounds + 1 if _FEW < unknown <= np.sum(np.isinf(gaps)) else 0
@@ -138,8 +138,8 @@ class Exit:
             least = max(_NEAR * whole / (2 * len(self.trace)), _UNSURE)
             finite = np.where(worst, 0.0, gaps)
             worst |= (finite > least) & (finite > 0.05 * np.max(finite, initial=0.0))
-            if not np.any(worst):
-                return
+            if not (left and np.any(worst)):
+                return  # what is split after the last look would have no costs
             self.trace.split(np.flatnonzero(worst))
 
     def log_of(self, number: int) -> float:

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
-from certbound.reach.affine.exit_bounds import AffineAnswer, AffineFailing, affine_answer, affine_failing
+from certbound.reach.affine.exit_bounds import (
+    AffineAnswer,
+    AffineFailing,
+    affine_answer,
+    affine_failing,
+    affine_pieces,
+)
 
-__all__ = ["affine_answer", "affine_failing", "AffineAnswer", "AffineFailing"]
+__all__ = ["affine_answer", "affine_failing", "affine_pieces", "AffineAnswer", "AffineFailing"]

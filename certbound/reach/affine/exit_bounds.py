@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from flint import ctx
 
 from certbound.display import log10_text
-from certbound.gaussian.affine import Inaccurate, bound_exits, bound_exits_below
+from certbound.gaussian.affine import Inaccurate, Stated, bound_exits, bound_exits_below, stated_exits
 from certbound.problem.problem import Problem
 from certbound.reach.affine.reading import AffineModel, affine_model
 
 _BITS = (192, 512, 1400, 4000)
+_SPARE = 64  # bits of the checker's balls beyond those with which pieces were found
 _FEW, _PART = 8, -4.0  # limits that a lower bound counts, and the least logarithm of their part of the likeliest one
 _LEAST = -1e12  # log10 of a probability that is not told apart from 0
 
@@ -65,6 +66,35 @@ def affine_answer(
             except Inaccurate:
                 continue
         return answer(found.log_probability, found.logs)
+    return None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AffinePieces:
+    """Pieces of time for a certificate of the exact law, the limits that they serve, and bits for balls."""
+
+    model: AffineModel
+    stated: Stated
+    bits: int
+
+    @property
+    def log10_delta(self) -> float:
+        """About what the checker proves of them."""
+        return _log10(math.log(min(sum(map(math.exp, self.stated.logs)), 1.0) + 1e-300))
+
+
+def affine_pieces(problem: Problem, near: float) -> AffinePieces | None:
+    """Pieces whose enclosures add about the part ``near`` to the bound; None where `affine_answer` has none either."""
+    model = affine_model(problem)
+    if model is None:
+        return None
+    for bits in _BITS:
+        with ctx.workprec(bits):
+            try:
+                stated = stated_exits(model.law(), model.rows, model.limits, near)
+            except Inaccurate:
+                continue
+        return AffinePieces(model=model, stated=stated, bits=bits + _SPARE)
     return None
 
 
