@@ -107,6 +107,26 @@ def test_interpolated_coefficients_are_off_by_at_most_their_errors(name: str, pa
         assert np.all(np.abs(p) <= field.slopes[0][0][cells] * (1 + 1e-9))
 
 
+def test_errors_of_interpolants_beside_a_kink_are_near_what_they_are() -> None:
+    """A controller that saturates: its range on a cell is twenty times what its interpolant misses."""
+    system = cb.ContinuousSystem(
+        lambda x, v: [v, np.clip(-20 * x - 6 * v, -3, 3)], states=["x", "v"], diffusion=[[0.0], [0.6]]
+    )
+    axes = (Axis(np.linspace(-0.5, 0.5, 21), Sampling(5)), Axis(np.linspace(-1.5, 1.5, 19), Sampling(5)))
+    points = points_in(axes, np.random.default_rng(5), 40_000)
+    cells = cell_of(axes, points)
+    *_, field = Fields(system.dynamics, 2).on(axes, Interval.point(0.0))
+    assert field is not None
+    rows = [_lagrange(one.sampling.nodes, (points[:, i] - one.nodes[cells[i]]) / np.diff(one.nodes)[cells[i]])
+            for i, one in enumerate(axes)]  # fmt: skip
+    places = [cells[i][:, None] * 5 + np.arange(6) for i in range(2)]
+    p = np.einsum("pi,pj,pij->p", *rows, field.lattice[places[0][:, :, None], places[1][:, None, :]])
+    missed = np.abs(p - np.clip(-20 * points[:, 0] - 6 * points[:, 1], -3, 3))
+    assert np.all(missed <= field.error[cells] + 1e-13)
+    assert 0.02 < missed.max()
+    assert field.error.max() < 5 * missed.max()
+
+
 def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
     rows = np.ones((len(places), len(nodes)))
     for i, node in enumerate(nodes):
