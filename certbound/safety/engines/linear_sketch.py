@@ -19,7 +19,7 @@ from certbound.problem.systems import ContinuousSystem
 from certbound.reach.nominal import Flow
 from certbound.safety.falsification import follow, rooms
 
-_FEWEST, _MOST = 3, 20
+_FEWEST, _MOST = 2, 20
 _ROOM = 1.1
 _PIECES = 48
 _SAMPLES = 64
@@ -32,8 +32,8 @@ _FITTED = 0.6  # of a remainder is left once the slopes are fitted
 def linear_chance(problem: Problem) -> float:
     """How far the constraints are away, in units of what the linear response needs at the problem's delta.
 
-    Infinite where nothing speaks against it: a linear model, discrete time, few states (whose sets of starts can be
-    halved), targets.
+    Infinite where nothing speaks against it: a linear model, discrete time, one state (where others are near the truth
+    at once), targets.
     """
     system, n = problem.system, problem.system.dimension
     if not isinstance(system, ContinuousSystem) or not _FEWEST <= n <= _MOST or problem.reach is not None:

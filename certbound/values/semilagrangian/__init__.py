@@ -4,7 +4,7 @@ From the bottom: ``confines`` (what bounds the states), ``noisy_axis`` (the prob
 covariance, enclosed), ``remainders`` (what the linearisation leaves out; how a path strays in a step), ``local_steps``
 (both, box by box), ``smoothers``, ``smoothing`` (the noise of one step), ``landings`` (of the flow), ``bands``,
 ``mirrors`` (what is beyond a noisy face), ``obstacles`` (passed within a step), ``backward`` (one step),
-``groundwork``, ``carried`` (three coordinates), ``sources`` (drifts with kinks), ``leaving``.
+``groundwork``, ``carried`` (three coordinates), ``leaving``.
 """
 
 from certbound.values.semilagrangian.leaving import bound_exits_by_steps

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -25,7 +24,6 @@ from certbound.values.semilagrangian.groundwork import layouts_of, nodes_of, tog
 from certbound.values.semilagrangian.local_steps import Plan
 from certbound.values.semilagrangian.noisy_axis import Setting, setting_of
 from certbound.values.semilagrangian.smoothing import Lines
-from certbound.values.semilagrangian.sources import bound_sourced_exits, kinked
 from certbound.watch import OutOfTime, poll
 
 _RARE = 560_000
@@ -47,7 +45,6 @@ _GROWTH = 0.12  # of the logarithm of nodes times steps from one plan to the nex
 _FIRST = 0.25  # share of the work that a first look may take where no scout tells how rare failing is
 _SPARE = 1e-9
 _OVERLOOKED = 1e-8  # what cells that are left out may cost, as a share of a scout's answer
-_GLANCE = 0.1  # of the seconds, for a look at whether kinks matter
 _CAUTION = 0.1  # for a scout's answer
 _RATE = 1_800_000
 """Nodes times steps that are done in a second on two cores (`_BESIDE` of that where an obstacle's tolls take the rest);
@@ -93,8 +90,6 @@ def bound_exits_by_steps(problem: Problem, *, seconds: float = 20.0) -> ExitBoun
         return bound_carried_exits(problem, seconds=seconds)
     begin = time.process_time()
     setting = setting_of(problem)
-    if kinked(setting.tape) and not setting.walls and not setting.timed:
-        return _across_kinks(setting, problem.delta, seconds, begin)
     return _stepped_exits(setting, problem.delta, seconds, begin)
 
 
@@ -127,24 +122,6 @@ def _stepped_exits(setting: Setting, delta: float, seconds: float, begin: float)
     upper = min(0.0, math.log10(best) * (1 - 1e-15) + 1e-15)
     lower = math.log10(least) * (1 + 1e-15) - 1e-15 if least > 0 else None
     return ExitBounds(upper=upper, lower=lower, words=words, seconds=time.process_time() - begin)
-
-
-def _across_kinks(setting: Setting, delta: float, seconds: float, begin: float) -> ExitBounds:
-    """Steps along the flow where they hold for all that (kinks that hardly a path meets), else sources."""
-    nothing = ExitBounds(upper=0.0, lower=None, words="", seconds=0.0)
-    try:
-        rough = _stepped_exits(setting, delta, _GLANCE * seconds, begin)
-    except InfeasibleError:
-        rough = nothing
-    if rough.lower is not None and rough.upper - rough.lower < 1:
-        return _stepped_exits(setting, delta, seconds, begin)
-    try:
-        found = bound_sourced_exits(setting, seconds=seconds)
-    except InfeasibleError:
-        found = nothing
-    if found.upper >= rough.upper:
-        return _stepped_exits(setting, delta, seconds, begin)
-    return replace(found, lower=rough.lower, seconds=time.process_time() - begin)
 
 
 def _plan(setting: Setting, turn: float, ratio: float, cells: Cells, spare: float) -> Plan:
