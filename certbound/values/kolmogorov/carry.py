@@ -64,7 +64,8 @@ and 7 with 1; more than 1 costs more than that."""
 
 _LASTING = 0.5  # share of a slab's source that its neighbours have at least, where it pays: a source that ends at once
 # leaves e a kink in time, and what that leaves moves through the slabs pass by pass
-_RESOLVED = 8.0  # from below exits count from about this times the time in which noise crosses the cell at a limit
+_RESOLVED = 8.0  # from below exits count from about this times the time in which noise crosses the cell at a limit,
+# or its root times that of the flow across it
 _LARGEST = 1e100  # a coefficient
 _STRIP, _PAD = 9, 5  # cells beyond noise-free and noisy limits, on which e lives
 _REACHED = 1.5

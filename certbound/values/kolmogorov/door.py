@@ -25,7 +25,7 @@ from certbound.values.kolmogorov.witness import Witness
 from certbound.watch import poll, seconds_left
 
 _COARSEST = {2: 0.08, 3: 0.1}  # cell of the first grid, as a share of the range
-_STEPS = 0.8  # cells of the range a step: with more steps than that the error does not fall
+_STEPS = 0.8  # steps of the first grid for each of its cells along the range; better ones follow the error
 _PASSES, _USUAL = 12, 5  # at most, and in most cases
 _AT_LEAST = 8  # where that many serve: to end a little late is better than to have proved nothing
 _ROUGH, _CORRECTED = 0.4, 0.4  # a solution with a look at it, and one correction, in units of a pass that proves

@@ -260,6 +260,15 @@ def test_exits_count_from_below_once_cells_resolve_the_layer_at_a_limit(monkeypa
     assert lower() < 0.75 * found
 
 
+def test_exits_that_the_flow_leads_across_a_limit_count_sooner_than_noise_alone_would_resolve_them() -> None:
+    """Of .17 that leave .127 were counted where cells had to be resolved by noise alone."""
+    system = cb.ContinuousSystem(lambda x, y: [0.5, -y], states=["x", "y"], diffusion=np.diag([0.1, 0.3]))
+    problem = cb.Problem(system, initial=[0.4, 0.0], safe=[cb.Inside(cb.Box([-1, -2], [1, 2]))], horizon=1.0)
+    side = side_of(stages_of(problem), 0.1, 12, False)
+    side.propose()
+    assert -largest_at_start(side, starts_in(problem))[0] > 0.15
+
+
 @pytest.mark.parametrize("build", [lambda: two_independent()[0], pushed], ids=["still", "changing"])
 def test_residuals_proved_while_the_error_is_solved_for_are_those_proved_after_it(
     build: Callable[[], cb.Problem], monkeypatch: pytest.MonkeyPatch

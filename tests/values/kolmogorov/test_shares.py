@@ -57,6 +57,22 @@ def test_cells_change_by_no_more_than_shares_tell() -> None:
         assert np.abs(np.diff(shape.sizes) / np.diff(shape.places)).max() < 0.3 * 3
 
 
+@pytest.mark.parametrize(("stiffness", "more"), [(8.0, True), (0.0, False)])
+def test_steps_are_more_where_they_lead_paths_across_many_cells(stiffness: float, more: bool) -> None:
+    """A spring with friction, whose paths cross 16 cells within a step, and friction without the spring."""
+    moving = stiffness > 0
+    system = cb.ContinuousSystem(
+        lambda x, v: [v if moving else 0.0, -stiffness * x - 0.4 * np.tanh(5 * v)], states=["x", "v"],
+        diffusion=[[0.0 if moving else 0.2, 0.0], [0.0, 0.42]],
+    )  # fmt: skip
+    problem = cb.Problem(system, initial=[0, 0], safe=[cb.Inside(cb.Box([-1, -1.6], [1, 1.6]))], horizon=6.0)
+    side, starts = side_of(stages_of(problem), 0.05, 16, True), starts_in(problem)
+    side.propose()
+    better, _ = adapted(side, starts, 2)
+    assert (len(better.steps) > 1.2 * len(side.steps)) == more
+    assert better.work < 1.2 * side.work
+
+
 def _random_equation(kind: type[Equation] | type[SplitEquation], n: int) -> Equation | SplitEquation:
     rng = np.random.default_rng(0)
     nodes = [np.sort(rng.uniform(-1, 1, 9 + k)) for k in range(n)]
