@@ -241,7 +241,7 @@ class Side:
 
     def steps_of(self, longest: Size) -> Array:
         """Steps that grow from the layer at the end on, where no break of the clock is in their way."""
-        return time_steps(self.setting.horizon - self.setting.begin, self._growing(longest))
+        return time_steps(self.setting.horizon - self.setting.begin, self._growing(longest), self.setting.dimension)
 
     def _growing(self, longest: Size) -> Size:
         return growing_steps(self.layer, longest, self.setting.dimension)
@@ -309,7 +309,7 @@ class Side:
         self.clock: Array | None = None
         self.times = horizon - np.append(0.0, np.cumsum(self.steps))
         if setting.timed or setting.staged:  # a stage is as long as it is
-            self.times = knots_of(begin, horizon, self._growing(longest), self.layer, setting.breaks)
+            self.times = knots_of(begin, horizon, self._growing(longest), self.layer, setting.breaks, setting.dimension)
             self.steps = -np.diff(self.times)
             self.brief = self.steps < 4 * HALF * horizon
             self.clock = 2 * CLOCK * horizon / self.steps

@@ -129,7 +129,7 @@ def test_the_clock_s_jumps_and_bends_are_found_and_each_stands_in_a_slab_of_its_
     ).dynamics  # fmt: skip
     breaks = clock_breaks([tape], 2.0)
     assert np.allclose(breaks, [0.3, 0.9, np.pi / 2, 1.8], atol=1e-12)
-    times = knots_of(0.0, 2.0, partial(np.full_like, fill_value=0.1), 0.1, breaks)
+    times = knots_of(0.0, 2.0, partial(np.full_like, fill_value=0.1), 0.1, breaks, 2)
     assert times[0] == 2.0
     assert times[-1] == 0.0
     assert np.all(np.diff(times) < 0)
