@@ -44,7 +44,7 @@ _SHARE, _ORDER = 0.8, 3.0  # of what the target leaves, that an error may take; 
 _FAR = 2.0  # ratio of the coarsest solution to the target, beyond which it says which bound decides
 _FEWEST = 8  # steps of a stage
 _STARTS = 9  # points along each side of a start set
-RATE = {2: 1.8e5, 3: 1.2e5}
+RATE = {2: 1.8e5, 3: 1.5e5}
 """Cells of space and time a second, by the number of states: a pass of residuals and correction on one core."""
 
 

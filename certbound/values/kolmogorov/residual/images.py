@@ -304,6 +304,8 @@ def _most_of_line(out, points, bend, chord, proved):  # type: ignore[no-untyped-
     count = points.shape[0]
     if proved and count == 6:
         _most_of_six(out, points, bend, chord)
+    elif proved and count == 5:
+        _most_of_five(out, points, bend, chord)
     elif proved and count == 4:
         _most_of_four(out, points, bend, chord)
     else:
@@ -337,6 +339,20 @@ def _most_of_six(out, p, bend, chord):  # type: ignore[no-untyped-def]
             c0 * u + c1 * v + c2 * w + c3 * x + c4 * y + c5 * z, d0 * u + d1 * v + d2 * w + d3 * x + d4 * y + d5 * z
         )
         out[k] = max(out[k], high + chord * max(max(first, second), 0.0))
+
+
+@compiled
+def _most_of_five(out, p, bend, chord):  # type: ignore[no-untyped-def]
+    """The same of five points, and three coefficients."""
+    a0, a1, a2, a3, a4 = bend[0, 0], bend[0, 1], bend[0, 2], bend[0, 3], bend[0, 4]
+    b0, b1, b2, b3, b4 = bend[1, 0], bend[1, 1], bend[1, 2], bend[1, 3], bend[1, 4]
+    c0, c1, c2, c3, c4 = bend[2, 0], bend[2, 1], bend[2, 2], bend[2, 3], bend[2, 4]
+    for k in range(out.size):
+        u, v, w, x, y = p[0, k], p[1, k], p[2, k], p[3, k], p[4, k]
+        high = max(max(max(u, v), max(w, x)), y)
+        first = max(a0 * u + a1 * v + a2 * w + a3 * x + a4 * y, b0 * u + b1 * v + b2 * w + b3 * x + b4 * y)
+        more = max(first, c0 * u + c1 * v + c2 * w + c3 * x + c4 * y)
+        out[k] = max(out[k], high + chord * max(more, 0.0))
 
 
 @compiled
