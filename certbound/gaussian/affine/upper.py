@@ -30,7 +30,6 @@ _NEAR = 0.01  # of the whole, what enclosures may add
 _ROUNDS, _MOST = 60, 6000  # halvings one after the other, and pieces
 _FEW, _VAIN = 8, 6  # pieces that are costly to look at, and halvings after which none of them became known: no more
 _LOOSE = 0.12  # in the exponent of a density, what the variance may move over a piece of a rough row
-_SMALL = 1e-3  # of the whole, shared by all pieces, below which a piece is left as it is
 _UNSURE = 1e-300
 _CERTAIN = 2.5  # logarithm of a number of crossings from which on nothing is said
 _MOST_STATES, _MOST_SIDES, _WATCHED = 80, 8, 12  # for first crossings: states, limits, and limits that marks watch

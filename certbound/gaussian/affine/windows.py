@@ -18,11 +18,16 @@ from certbound.gaussian.affine.trace import Trace
 from certbound.gaussian.scalar import lift, log_between, log_line_crossing, log_tail
 from certbound.rigor.rounding import quiet
 
-_CLOCKS = (0.3, 0.8, 1.5, 2.5, 3.5, 5.0, 7.0, np.inf)  # of a window times the square of its level, which are tried
-_LONGEST = 3.9  # clock of a window: longer ones cost about what a start anew does
+CLOCKS = (0.3, 0.8, 1.5, 2.5, 3.5, 5.0, 7.0, np.inf)
+"""Clocks of windows, times the squares of their levels, which are tried; infinite: a piece is one window."""
+LONGEST = 3.9
+"""Clock of a window: longer ones cost about what a start anew does, and the checker looks at none from 4 on."""
+MOST_WINDOWS = 1e9
+"""Windows of a piece that a certificate may state."""
+SHARES = (0.5, 0.8, 0.95, 0.99)
+"""Parts of a level that what moves most may take of it, as the checker tries them."""
+
 _SHORTEST = 1e-18  # clock of a window
-_MOST = 1e9  # windows of a piece
-_SHARES = (0.5, 0.8, 0.95, 0.99)  # parts of a level that what moves most may take of it
 _SAFE = 1 + 1e-12  # by which results of a few operations are raised
 
 
@@ -92,15 +97,15 @@ def _in_windows(sides: _Sides, h: Array, line: tuple[Array, Array], ends: tuple[
     rate = sides.own / (2 * sides.s_low)
     usable = (first > 0) & (last > 0) & (sides.s_low > 0)
     best, windows = np.full(len(h), np.inf), np.ones(len(h))
-    for clock in _CLOCKS:
-        count = np.clip(np.ceil(h * rate * np.maximum(many, 0.5) ** 2 / clock), 1, _MOST)
+    for clock in CLOCKS:
+        count = np.clip(np.ceil(h * rate * np.maximum(many, 0.5) ** 2 / clock), 1, MOST_WINDOWS)
         length = h / count * (1 + 1e-15)
         decay, spread = sides.rates(length)
         fallen = np.where(count > 1, 0.0, (spread * length + falls) * _SAFE)
         spent = np.maximum(np.maximum(decay * length, fallen), _SHORTEST) * _SAFE
         start = np.where(count > 1, many, alone)
         stop = np.where(count > 1, many, alone * np.exp(-fallen) / _SAFE)
-        tried = usable & (spent < _LONGEST) & (start > 0) & np.isfinite(start)
+        tried = usable & (spent < LONGEST) & (start > 0) & np.isfinite(start)
         cost = np.full(len(h), np.inf)
         cost[tried] = log_line_crossing(start[tried], stop[tried], spent[tried]) + np.log(count[tried]) + 1e-14
         better = cost < best
@@ -117,7 +122,7 @@ def crude_parts(trace: Trace, lines: Array, chosen: Integers) -> Chain:
     h, e = trace.steps[chosen], trace.speed_of()[1][chosen]
     rests = start == 0
     best = np.zeros(len(h))
-    for share in _SHARES:
+    for share in SHARES:
         before = np.where(rests, 0.0, share)
         noise = np.where(rests, share, 0.9 * (1 - share)) if own > 0 else np.zeros(len(h))
         rest = (1 - before - noise) * (1 - 1e-9)  # what is lost to rounding
