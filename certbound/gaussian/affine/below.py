@@ -62,8 +62,15 @@ def bound_exits_below(law: AffineLaw, rows: Sequence[Sequence[float]], asked: Se
 
 
 def _period(law: AffineLaw, row: list[arb]) -> float:
-    """About the mean time between upcrossings of the middle, or what noise of its own takes to matter."""
+    """About the mean time between upcrossings of the middle, or what noise of its own takes to matter.
+
+    At the end of the horizon, and no longer than that: a stationary start's variance grows by nothing.
+    """
     final = law.doubling.gramian(GAIN, 0)
+    if LOSS in law.doubling.sources:
+        final = final - law.doubling.gramian(LOSS, 0)
+    if law.covariance is not None:
+        final = final + law.covariance
     fast = rows_of(arb_mat([row]) * law.slope)[0]
     s2 = float(dot(rows_of(arb_mat([row]) * final)[0], row).mid())
     e2 = float(dot(rows_of(arb_mat([fast]) * final)[0], fast).mid())
@@ -71,7 +78,7 @@ def _period(law: AffineLaw, row: list[arb]) -> float:
     if s2 <= 0:
         return law.horizon
     smooth = 2 * np.pi * np.sqrt(s2 / e2) if e2 > 0 else law.horizon
-    return float(min(smooth, 2 * s2 / own)) if own > 0 else float(smooth)
+    return float(min(smooth, 2 * s2 / own if own > 0 else smooth, law.horizon))
 
 
 def _pair(first: Array, second: Array, high: Array) -> Array:

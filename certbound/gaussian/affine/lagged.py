@@ -306,11 +306,15 @@ def lagged_cost(law: AffineLaw, row: Sequence[float], level: float, marks: Seque
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Costs:
-    """Logs of what pieces of time cost, each at a constant rate at most; crossings count from ``lag`` on."""
+    """Logs of what pieces of time cost, each at a constant rate at most; crossings count from ``lag`` on.
+
+    Where ``logs`` are infinite ``whole`` says what all of a piece or any part of it costs.
+    """
 
     times: Array
     logs: Array
     lag: float
+    whole: Array | None = None
 
     def share(self, last: float) -> float:
         """What part of the whole the time until ``last`` costs."""
@@ -321,8 +325,12 @@ class Costs:
         inside = np.minimum(self.times[1:], last) - np.maximum(self.times[:-1], first)
         part = np.clip(inside / np.diff(self.times) * (1 + 1e-12) + 1e-15, 0.0, 1.0)
         part = np.where(inside + 1e-12 * self.times[-1] <= 0, 0.0, part)
+        logs = self.logs
+        if self.whole is not None:
+            part = np.where((part > 0) & np.isinf(logs), 1.0, part)
+            logs = np.fmin(logs, self.whole)
         with np.errstate(over="ignore", invalid="ignore"):
-            return float(np.sum(np.where(part > 0, np.exp(np.minimum(self.logs, 50.0)) * part, 0.0)) * (1 + 1e-11))
+            return float(np.sum(np.where(part > 0, np.exp(np.minimum(logs, 50.0)) * part, 0.0)) * (1 + 1e-11))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,8 +47,6 @@ class AffineLaw:
         V_0 of a random start.
     disturbances : sequence of arb_mat
         E_j times the disturbance's radius, each (n, 1): it may take any values in [-1, 1] of that.
-    kept : tuple of float, optional
-        A row a along which M- is next to nothing, where a M a > 0: the variance of a Z does not fall at once then.
     """
 
     slope: arb_mat
@@ -58,7 +56,6 @@ class AffineLaw:
     starts: arb_mat | None = None
     covariance: arb_mat | None = None
     disturbances: tuple[arb_mat, ...] = ()
-    kept: tuple[float, ...] | None = None
 
     @property
     def dimension(self) -> int:
@@ -84,8 +81,7 @@ class AffineLaw:
         moved = self.slope * self.covariance
         source = moved + moved.transpose() + gram
         n = self.dimension
-        rest = source - self._along_row(source)
-        middle = np.array([[float(rest[i, j].mid()) for j in range(n)] for i in range(n)])
+        middle = np.array([[float(source[i, j].mid()) for j in range(n)] for i in range(n)])
         scale = np.sqrt(np.maximum(np.abs(middle).max(axis=1), 1e-300))
         values, vectors = np.linalg.eigh(middle / scale / scale[:, None])
         raised = np.maximum(-values, 0.0) + _RAISED * np.abs(values).max(initial=_NOTHING)
@@ -96,15 +92,6 @@ class AffineLaw:
         if not is_semidefinite(gain, scale):
             raise EngineError("the random start's covariance changes in a way that could not be split.")
         return gain, loss
-
-    def _along_row(self, source: arb_mat) -> arb_mat:
-        """M a a' M / (a' M a): what is left of M without it vanishes along a."""
-        zero = arb_mat(self.dimension, self.dimension)
-        if self.kept is None:
-            return zero
-        image = source * arb_mat([[value] for value in self.kept])
-        size = (arb_mat([list(self.kept)]) * image)[0, 0]
-        return image * image.transpose() / size if size > 0 else zero
 
     @cached_property
     def doubling(self) -> Doubling:

@@ -17,12 +17,12 @@ import numpy as np
 from flint import arb_mat
 
 from certbound.arrays import Array, Integers, Mask
-from certbound.gaussian.affine.law import floats, root_up
+from certbound.gaussian.affine.law import GAIN, floats, root_up
 from certbound.gaussian.affine.trace import Trace, dot, rows_of
+from certbound.gaussian.affine.windows import Chain, own_noise
 from certbound.gaussian.scalar import (
     Clock,
     clock_crossing,
-    lift,
     log_between,
     log_line_crossing,
     log_polygon_crossing,
@@ -54,10 +54,9 @@ class Lags:
 def lags_of(trace: Trace, longest: float) -> Lags:
     """Lags up to about ``longest``, fine enough at the first for the row's own noise."""
     law, doubling = trace.law, trace.law.doubling
-    top = trace.matrices[-1][0] if law.covariance is None else trace.matrices[-1][0] + law.covariance
+    top = doubling.gramian(GAIN, 0) if law.covariance is None else doubling.gramian(GAIN, 0) + law.covariance
     size = float(np.max(trace.s[1])) ** 0.5
-    row = arb_mat([trace.row])
-    own = float(floats((row * (law.noise * law.noise.transpose()) * row.transpose()).entries())[1][0])
+    row, own = arb_mat([trace.row]), own_noise(trace)
     level = 0
     third = row * law.slope * law.slope * law.slope
     sharp = float(root_up(floats([dot(third.entries(), (third * top).entries())])[1])[0])
@@ -111,8 +110,7 @@ class Decays:
     def __post_init__(self) -> None:
         self._known: dict[tuple[int, int], Array] = {}
         self._moved = _plain(self.lags.moved)
-        noise, row = self.trace.law.noise, arb_mat([self.trace.row])
-        self.own = float(floats((row * (noise * noise.transpose()) * row.transpose()).entries())[1][0])
+        self.own = own_noise(self.trace)
 
     def of(self, places: Integers) -> Array:
         """(P, 2, J + 1): a lower bound of g/s^2 at every lag, and how far below its chord it may be until the next one.
@@ -123,6 +121,7 @@ class Decays:
         keys = [(int(trace.levels[k]), trace.indices[k]) for k in places.tolist()]
         new = [(key, k) for key, k in zip(keys, places.tolist()) if key not in self._known]
         if new:
+            self._matrices = trace.matrices()
             for (key, _), values in zip(new, self.over([(k, k + 1) for _, k in new])):
                 self._known[key] = values
         return np.array([self._known[key] for key in keys])
@@ -136,7 +135,7 @@ class Decays:
         start = None if law.covariance is None else law.covariance * own
         vectors = []
         for k, _ in spans:
-            gain, loss = trace.matrices[k]
+            gain, loss = self._matrices[k]
             vector = gain * own - loss * own
             vectors.append(vector if start is None else vector + start)
         joined = arb_mat([[v[i, 0] for v in vectors] for i in range(law.dimension)])
@@ -170,7 +169,7 @@ class Decays:
 
     def _norms(self, first: int, last: int) -> Array:
         """Norms of the moved rows in D+ + D- over a run of pieces, in floats with their rounding."""
-        before, after = self.trace.matrices[first], self.trace.matrices[last]
+        before, after = self._matrices[first], self._matrices[last]
         middle, radius = _plain(after[0] - before[0] + after[1] - before[1])
         slack = 4e-16 * len(middle)
         rows, error = self._moved
@@ -182,14 +181,12 @@ class Decays:
 
 
 @quiet
-def rough_parts(
-    trace: Trace, decays: Decays, lines: Array, chosen: Integers, *, closely: bool
-) -> tuple[Array, Array]:
-    """What crossing ``lines`` (K, 2) costs: at the start, and piece by piece; natural logarithms.
+def rough_parts(trace: Trace, decays: Decays, lines: Array, chosen: Integers, *, closely: bool) -> Chain:
+    """What crossing ``lines`` (K, 2) costs on the ``chosen`` pieces, which follow each other.
 
-    Of the ``chosen`` pieces, which follow each other. The level counts as constant over a piece, the least z over the
-    largest s. A piece is cut into equal blocks, no longer than the lags over which its decay is known. Only ``closely``
-    some of the variance may stand still over a block.
+    The level counts as constant over a piece, the least z over the largest s. A piece is cut into equal blocks, no
+    longer than the lags over which its decay is known. Only ``closely`` some of the variance may stand still over a
+    block.
     """
     low, high = (x[chosen] for x in trace.spread_of())
     level = np.min(lines[chosen], axis=1) / root_up(high) * (1 - 1e-14)
@@ -198,23 +195,18 @@ def rough_parts(
     costs = np.full(len(chosen), np.inf)
     for share in _SHARES if closely else _SHARES[:1]:
         costs = np.fmin(costs, _with_share(share, known, decays.lags.times, trace.steps[chosen], level, grown))
-    usable = (level >= 0) & (low > 0)
-    costs = np.where(usable, costs, np.inf)
-    first = np.asarray(log_tail(level[:1]) if np.isfinite(costs[0]) else np.array([-np.inf]))
-    jumps = np.full(len(chosen), -np.inf)
-    falls = level[1:] < level[:-1]
-    jumps[1:] = np.where(falls, log_between(level[1:], level[:-1]), -np.inf)
-    if not np.isfinite(costs[0]):
-        costs[0] = _beginning(trace, int(chosen[0]), lines)
-        jumps[1:2] = log_tail(level[1:2])  # nothing is said of the end of the first piece
-    return first, np.asarray(lift(np.logaddexp(costs, jumps), 16))
+    costs = np.where((level >= 0) & (low > 0), costs, np.inf)
+    return Chain(costs=costs, enters=level, leaves=level)
 
 
 @quiet
-def joined_parts(trace: Trace, decays: Decays, lines: Array, chosen: Integers, pieces: Array) -> Array:
-    """The costs of `rough_parts` where short pieces that follow each other are one block: all of it at the first.
+def joined_parts(
+    trace: Trace, decays: Decays, lines: Array, chosen: Integers, pieces: Array, leaves: Array
+) -> Array:  # fmt: skip
+    """The costs of pieces where short ones that follow each other are one block: all of it at the first.
 
-    Every piece is a window of the block's polygon then, and begins nothing anew.
+    Every piece is a window of the block's polygon then, and begins nothing anew. ``leaves``: levels at the ends of
+    pieces, as in `Chain`, none of which is below the level of a polygon there.
     """
     low, high = (x[chosen] for x in trace.spread_of())
     level = np.min(lines[chosen], axis=1) / root_up(high) * (1 - 1e-14)
@@ -228,7 +220,7 @@ def joined_parts(trace: Trace, decays: Decays, lines: Array, chosen: Integers, p
         if runs:
             known = decays.over([(int(chosen[first]), int(chosen[last - 1]) + 1) for first, last in runs])
             speeds = _speeds(0.0, known[:, 0], known[:, 1], times[1:])
-            found = _by_runs(runs, speeds, times[1:], h, level, grown, pieces, unknown=bool(low[0] <= 0))
+            found = _by_runs(runs, speeds, times[1:], h, level, grown, pieces, leaves)
             if np.logaddexp.reduce(found) < np.logaddexp.reduce(best):
                 best = found
     return best
@@ -249,13 +241,10 @@ def _runs(about: Array, fits: Mask, most: float) -> list[tuple[int, int]]:
 
 
 def _by_runs(
-    runs: list[tuple[int, int]], speeds: Array, ends: Array, h: Array, level: Array, grown: Array, pieces: Array, *,
-    unknown: bool,
+    runs: list[tuple[int, int]], speeds: Array, ends: Array, h: Array, level: Array, grown: Array, pieces: Array,
+    leaves: Array,
 ) -> Array:
-    """The costs with each run as one block, where that is less.
-
-    ``unknown``: nothing is said of the end of the very first piece.
-    """
+    """The costs with each run as one block, where that is less."""
     result = pieces.copy()
     for (first, last), speed in zip(runs, speeds):
         reach = int(np.searchsorted(ends, np.sum(h[first:last]) * (1 + 1e-12)))
@@ -267,10 +256,8 @@ def _by_runs(
         whole = 10.0 ** (clock_crossing(clock, own) * (1 - 1e-15) + 1e-14)
         rest = whole - float(np.exp(log_tail_below(own[:1]))[0]) * (1 - 1e-12)  # but for being above at the start
         cost = float(np.log(max(rest, 0.0) + 1e-300)) + 1e-12
-        if first == 1 and unknown:
-            cost = float(np.logaddexp(cost, log_tail(own[:1])[0]))
-        elif first and own[0] < level[first - 1]:  # the step from the piece before
-            cost = float(np.logaddexp(cost, log_between(own[:1], level[first - 1 : first])[0]))
+        if first and own[0] < leaves[first - 1]:  # the step from the piece before
+            cost = float(np.logaddexp(cost, log_between(own[:1], leaves[first - 1 : first])[0]))
         if cost < np.logaddexp.reduce(pieces[first:last]):
             result[first:last] = -np.inf
             result[first] = cost
@@ -370,24 +357,3 @@ def _plain_costs(levels: Array, clock: Array) -> Array:
     safe = np.where(np.isfinite(top), top, 0.0)
     sums = np.add.reduceat(np.exp(logs - np.repeat(safe, counts)), heads)
     return np.asarray(np.where(np.isfinite(top), safe + np.log(sums) + 1e-12, top))
-
-
-def _beginning(trace: Trace, k: int, lines: Array) -> float:
-    """P(a Z exceeds the line within a first piece that starts from a V_0 a = 0), crudely.
-
-    sup a Z <= sup a G W + int |a A Z|; the first by reflection, the second by E exp(l Y) <= 2 exp(l^2 h^2 e/2).
-    """
-    if k != 0 or trace.s[1][0] > 0:
-        return np.inf
-    h, z = float(trace.steps[0]), float(np.min(lines[0]))
-    if z <= 0:
-        return np.inf
-    row = arb_mat([trace.row])
-    own = root_up(floats((row * (trace.law.noise * trace.law.noise.transpose()) * row.transpose()).entries())[1])[0]
-    speed = float(trace.speed_of()[1][0])
-    best = np.inf
-    for share in (0.5, 0.8, 0.95, 0.99):
-        first = np.log(2.0) + float(log_tail(share * z / (own * np.sqrt(h)) * (1 - 1e-12)))
-        second = np.log(2.0) - (0.999999 * (1 - share) * z) ** 2 / (2 * h * h * speed + 1e-300)
-        best = min(best, float(np.logaddexp(first, second)) + 1e-12)
-    return best

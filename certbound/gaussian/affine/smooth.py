@@ -6,6 +6,7 @@ import numpy as np
 
 from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.trace import Trace
+from certbound.gaussian.affine.windows import crude_parts
 from certbound.gaussian.scalar import log_crossings
 from certbound.rigor.rounding import quiet
 
@@ -25,7 +26,7 @@ def _chord(first: Array, last: Array) -> Array:
 @quiet
 def smooth_parts(trace: Trace, lines: Array, chosen: Integers) -> tuple[Array, Array, Array, Array]:
     """What crossing ``lines`` (K, 2) costs: at the start, piece by piece, about that without enclosures, and at the
-    highest rate of each piece.
+    highest rate of each piece (infinite where what is sure from any start costs less than crossings).
 
     Natural logarithms; of the ``chosen`` pieces, which follow each other. The variance has the slope 2 c, so that it
     lies within h (sup c - inf c)/2 of its chord.
@@ -58,10 +59,16 @@ def smooth_parts(trace: Trace, lines: Array, chosen: Integers) -> tuple[Array, A
     middle = 0.5 * (chords[0][:, :-1] + chords[1][:, 1:])
     c = 0.5 * (c_low + c_high)
     e = 0.25 * (trace.e[0][pick] + trace.e[1][pick] + trace.e[0][after] + trace.e[1][after])
-    at = np.repeat(levels.mean(axis=-1)[:, None], 2, axis=1)
+    at = levels + flat(trace.chord_error[pick])[:, None]
     _, about, _ = log_crossings(spans, at, middle.ravel().clip(1e-290), flat(c), flat(e).clip(1e-290))
     peaks = np.max(rates.reshape(-1, PARTS), axis=1) + np.log(PARTS) + 1e-13
-    return first, _sums(rates), _sums(about), peaks
+    crude, pieces = crude_parts(trace, lines, chosen).costs, _sums(rates)
+    least = np.min(lines[pick], axis=1)
+    blurred = (least <= 0) & (least + trace.chord_error[pick] > 0)  # the start and jumps cost more than crossings there
+    pieces = np.where(blurred, np.maximum(pieces, 0.0), pieces)
+    crossed = (pieces <= crude) & ~blurred
+    about, peaks = np.where(crossed, _sums(about), -np.inf), np.where(crossed, peaks, np.inf)
+    return first, np.fmin(pieces, crude), about, peaks
 
 
 def _sums(logs: Array) -> Array:

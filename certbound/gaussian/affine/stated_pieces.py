@@ -18,6 +18,7 @@ from certbound.gaussian.affine.doubling import Doubling
 from certbound.gaussian.affine.law import GAIN, LOSS, MEAN, WIDE, AffineLaw, transposed_square
 from certbound.gaussian.affine.trace import Inaccurate
 from certbound.gaussian.affine.upper import Limit
+from certbound.gaussian.affine.windows import CLOCKS, LONGEST, MOST_WINDOWS, SHARES
 from certbound.gaussian.scalar import log_line_crossing, log_tail
 from certbound.rigor.rounding import quiet
 from certbound.watch import poll
@@ -25,10 +26,6 @@ from certbound.watch import poll
 _DEEPEST, _MOST, _ROUNDS = 60, 30_000, 80  # halvings of the horizon, pieces of a grid, and rounds of halving
 _VAIN = 5  # rounds one after the other that gained nothing: no more
 _RAISED = 2.0**-32  # of the size of what a random start's variance changes by: what both of its parts are raised by
-_CLOCKS = np.array([0.3, 0.8, 1.5, 2.5, 3.5, 5.0, 7.0])  # of a window times the square of its level, which are tried
-_LONGEST = 3.9  # clock of a window
-_MOST_WINDOWS = 1e9
-_SHARES = (0.5, 0.8, 0.95, 0.99)  # parts of a level, as the checker tries them
 _LEAST = 1e-300
 _ACCURATE = 1e-9  # of a matrix's largest entry, by which its balls may be wide
 
@@ -335,15 +332,15 @@ class _Direction:
         falls = np.maximum(np.log(level[0] / level[1]), 0.0)
         rate = self.own / (2 * np.maximum(s_low, _LEAST))
         best, windows = np.full(len(h), np.inf), np.ones(len(h))
-        for clock in (*_CLOCKS, np.inf):
-            count = np.clip(np.ceil(h / (clock / np.maximum(many, 0.5) ** 2 / rate)), 1, _MOST_WINDOWS)
+        for clock in CLOCKS:
+            count = np.clip(np.ceil(h / (clock / np.maximum(many, 0.5) ** 2 / rate)), 1, MOST_WINDOWS)
             length = h / count
             decay, spread = self._rates(length, sides)
             fallen = np.where(count > 1, 0.0, spread * length + falls)
             spent = np.maximum(np.maximum(decay * length, fallen), 1e-18)
             first = np.where(count > 1, many, alone)
             last = np.where(count > 1, many, alone * np.exp(-fallen))
-            usable = (spent < _LONGEST) & (first > 0) & np.isfinite(first)
+            usable = (spent < LONGEST) & (first > 0) & np.isfinite(first)
             logs = log_line_crossing(*(np.where(usable, x, 1.0) for x in (first, last, spent)))
             cost = np.where(usable, count * np.exp(logs), np.inf)
             better = cost < best
@@ -369,7 +366,7 @@ class _Direction:
         s, h, e, least = self.s[:-1][chosen], self.h[chosen], self.e_high[chosen], level.min(axis=0)
         rests = s == 0
         best = np.ones(len(h))
-        for share in _SHARES:
+        for share in SHARES:
             if self.own == 0:
                 before, noise = np.where(rests, 0.0, share), np.zeros(len(h))
                 rest = np.where(rests, 1.0, 1 - share)

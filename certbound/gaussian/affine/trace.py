@@ -3,7 +3,8 @@
 For a row a let r(t) = a F(t), q = r A. With xi = a Z: s^2 = Var xi, c = cov(xi, a A Z) and e = Var(a A Z). From a
 piece's start t_k on, V changes by D+ - D- with 0 <= D+(t) <= D+(h), the same for D-. So s^2 lies within [s_k^2 - r
 Q-(h) r, s_k^2 + r Q+(h) r], e likewise, and c within half of sqrt(r Q+ r . q Q+ q) + sqrt(r Q- r . q Q- q) of the mean
-of its ends, since 2 D(t) - D(h) lies between -D(h) and D(h). None of that asks how fast the model is.
+of its ends, since 2 D(t) - D(h) lies between -D(h) and D(h). None of that asks how fast the model is. Rows with noise
+of their own ask for two more: d = cov(xi, a A^2 Z), as c with q A in the place of q, and v = Var(a A^3 Z), as e.
 
 The mean u(t) = r(t) x lies within h^(3/2)/sqrt(48) of its chord, times the root of int u''^2 = (q A) Q_x(h) (q A)^T
 with the Gramian Q_x of x x^T (Cauchy and Schwarz with Green's function of the chord).
@@ -12,6 +13,7 @@ with the Gramian Q_x of x x^T (Cauchy and Schwarz with Green's function of the c
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from fractions import Fraction
 
 import numpy as np
 from flint import arb, arb_mat
@@ -54,7 +56,7 @@ class Trace:
 
     law: AffineLaw
     row: Row
-    full: bool = False  # whether covariance matrices are kept
+    full: bool = False  # whether d and v are followed
     levels: Integers = field(init=False)
     indices: list[int] = field(init=False)
 
@@ -62,23 +64,18 @@ class Trace:
         law, self.levels, self.indices = self.law, np.zeros(1, dtype=np.intp), [0]
         n = law.dimension
         self.rows = [self.row]
-        starts = [arb(0), arb(0), arb(0)]
+        starts = [arb(0)] * (5 if self.full else 3)
         if law.covariance is not None:
-            image = rows_of(arb_mat([self.row]) * law.covariance)[0]
-            own = rows_of(arb_mat([self.row]) * law.slope)[0]
-            starts = [square_of(self.row, image), dot(image, own),
-                      square_of(own, rows_of(arb_mat([own]) * law.covariance)[0])]
-        zero = arb_mat(n, n)
-        self.matrices = [(zero, zero)] if self.full else []
+            found, _ = self._moments(arb_mat([self.row]), law.covariance)
+            starts = [values[0] for values in found]
+        self._matrices = {Fraction(0): (arb_mat(n, n), arb_mat(n, n))}
         self._ends: list[list[arb]] = [starts, []]
         self._means: list[arb] = [self._mean(self.row), arb(0)]
         self._wides: list[arb] = [self._wide(self.row), arb(0)]
-        pieces, found = self._pieces([self.row], 0)
+        pieces, changes = self._pieces([self.row], 0)
         last = rows_of(arb_mat([self.row]) * law.doubling.transition(0))[0]
-        self._ends[1] = [start + more for start, more in zip(starts, found[0])]
+        self._ends[1] = [start + more for start, more in zip(starts, changes[0])]
         self._means[1], self._wides[1] = self._mean(last), self._wide(last)
-        if self.full:
-            self.matrices.append(self._grown(0, 0))
         self.columns = {name: np.array(values) for name, values in pieces.items()}
         self._finish()
 
@@ -90,38 +87,42 @@ class Trace:
             return arb(0)
         return sum((abs(x) for x in (arb_mat([row]) * self.law.starts).entries()), arb(0))
 
-    def _grown(self, node: int, level: int) -> tuple[arb_mat, arb_mat]:
-        """V+ and V- a step of that level after a node."""
-        doubling = self.law.doubling
-        forward = doubling.transition(level)
-        back = forward.transpose()
-        gain, loss = self.matrices[node]
-        gain = forward * gain * back + doubling.gramian(GAIN, level)
-        if LOSS in doubling.sources:
-            loss = forward * loss * back + doubling.gramian(LOSS, level)
-        return gain, loss
+    def matrices(self) -> list[tuple[arb_mat, arb_mat]]:
+        """V+ and V- at the ends of the pieces; two products of matrices for each that was not asked for before."""
+        doubling, known, found = self.law.doubling, self._matrices, [self._matrices[Fraction(0)]]
+        for level, index in zip(self.levels.tolist(), self.indices):
+            place = Fraction(index + 1, 1 << level)
+            if place not in known:
+                poll("covariances")
+                forward = doubling.transition(level)
+                back = forward.transpose()
+                gain, loss = found[-1]
+                gain = forward * gain * back + doubling.gramian(GAIN, level)
+                if LOSS in doubling.sources:
+                    loss = forward * loss * back + doubling.gramian(LOSS, level)
+                known[place] = gain, loss
+            found.append(known[place])
+        return found
 
     def _pieces(self, rows: list[Row], level: int) -> tuple[dict[str, list[float]], list[list[arb]]]:
         """What is known over pieces of a level from the rows at their starts, and how much s^2, c and e change."""
         law, doubling = self.law, self.law.doubling
         matrix = arb_mat(rows)
         moved = matrix * law.slope
-        own = rows_of(moved)
-        changes = [[arb(0)] * 3 for _ in rows]
+        changes = [[arb(0)] * (5 if self.full else 3) for _ in rows]
         balls: dict[str, list[arb]] = {}
         for name, sign in ((GAIN, 1), (LOSS, -1)):
             if name in doubling.sources:
-                gramian = doubling.gramian(name, level)
-                images, own_images = rows_of(matrix * gramian), rows_of(moved * gramian)
-                squares = [square_of(r, image) for r, image in zip(rows, images)]
-                speeds = [square_of(q, image) for q, image in zip(own, own_images)]
-                for change, r2, image, q, q2 in zip(changes, squares, images, own, speeds):
-                    change[0] += sign * r2
-                    change[1] += sign * dot(image, q)
-                    change[2] += sign * q2
+                found, bends = self._moments(matrix, doubling.gramian(name, level))
+                for change, *own in zip(changes, *found):
+                    for i, value in enumerate(own):
+                        change[i] += sign * value
             else:
-                squares = speeds = [arb(0)] * len(rows)
-            balls[f"{name} s"], balls[f"{name} e"] = squares, speeds
+                found = [[arb(0)] * len(rows)] * (5 if self.full else 3)
+                bends = found[0]
+            balls[f"{name} s"], balls[f"{name} e"] = found[0], found[2]
+            if self.full:
+                balls[f"{name} b"], balls[f"{name} v"] = bends, found[4]
         result = {name: floats(values)[1].tolist() for name, values in balls.items()}
         step = float(doubling.step(level)) * (1 + 1e-15)
         turned = moved * law.slope
@@ -140,10 +141,29 @@ class Trace:
         result["pushed"] = pushed.tolist()
         return result, changes
 
+    def _moments(self, rows: arb_mat, form: arb_mat) -> tuple[list[list[arb]], list[arb]]:
+        """s^2, c and e of rows under a covariance, and (``full``) d, v, and Var(a A^2 Z) apart."""
+        slope, own = self.law.slope, rows_of(rows)
+        moved, images = rows * slope, rows_of(rows * form)
+        first = rows_of(moved)
+
+        def squares(matrix: arb_mat) -> list[arb]:
+            return [square_of(r, image) for r, image in zip(rows_of(matrix), rows_of(matrix * form))]
+
+        found = [[square_of(r, image) for r, image in zip(own, images)]]
+        found.append([dot(image, q) for image, q in zip(images, first)])
+        found.append(squares(moved))
+        if not self.full:
+            return found, []
+        again = moved * slope
+        found.append([dot(image, q) for image, q in zip(images, rows_of(again))])
+        found.append(squares(again * slope))
+        return found, squares(again)
+
     def split(self, places: Integers) -> None:
         """Halve the pieces at these places."""
         chosen = np.unique(places)
-        added: dict[int, tuple[list[dict[str, float]], Row, list[arb], arb, arb, tuple[arb_mat, arb_mat] | None]] = {}
+        added: dict[int, tuple[list[dict[str, float]], Row, list[arb], arb, arb]] = {}
         doubling = self.law.doubling
         for level in np.unique(self.levels[chosen]).tolist():
             if level >= _DEEPEST:
@@ -156,9 +176,8 @@ class Trace:
             for i, k in enumerate(own):
                 ends = [start + more for start, more in zip(self._ends[k], changes[i])]
                 halves = [{name: values[j] for name, values in pieces.items()} for j in (i, len(own) + i)]
-                matrices = self._grown(k, level + 1) if self.full else None
-                added[k] = halves, middle[i], ends, self._mean(middle[i]), self._wide(middle[i]), matrices
-        levels, indices, rows, ends, means, wides, matrices_ = [], [], [], [], [], [], []
+                added[k] = halves, middle[i], ends, self._mean(middle[i]), self._wide(middle[i])
+        levels, indices, rows, ends, means, wides = [], [], [], [], [], []
         columns: dict[str, list[float]] = {name: [] for name in self.columns}
         before = {name: values.tolist() for name, values in self.columns.items()}
         for k, level in enumerate(self.levels.tolist()):
@@ -166,37 +185,32 @@ class Trace:
             ends.append(self._ends[k])
             means.append(self._means[k])
             wides.append(self._wides[k])
-            if self.full:
-                matrices_.append(self.matrices[k])
             if k not in added:
                 levels.append(level)
                 indices.append(self.indices[k])
                 for name in columns:
                     columns[name].append(before[name][k])
                 continue
-            halves, row, end, mean, wide, matrices = added[k]
+            halves, row, end, mean, wide = added[k]
             levels += [level + 1, level + 1]
             indices += [2 * self.indices[k], 2 * self.indices[k] + 1]
             rows.append(row)
             ends.append(end)
             means.append(mean)
             wides.append(wide)
-            if matrices is not None:
-                matrices_.append(matrices)
             for name in columns:
                 columns[name] += [half[name] for half in halves]
         self.levels, self.indices, self.rows = np.array(levels, dtype=np.intp), indices, rows
         self._ends, self._means = [*ends, self._ends[-1]], [*means, self._means[-1]]
         self._wides = [*wides, self._wides[-1]]
-        if self.full:
-            self.matrices = [*matrices_, self.matrices[-1]]
         self.columns = {name: np.array(values) for name, values in columns.items()}
         self._finish()
 
     def _finish(self) -> None:
         """Ends and pieces as floats."""
-        s, c, e = ([end[i] for end in self._ends] for i in range(3))
-        self.s, self.c, self.e = floats(s), floats(c), floats(e)
+        self.s, self.c, self.e, *more = (floats([end[i] for end in self._ends]) for i in range(len(self._ends[0])))
+        if self.full:
+            self.d, self.v = more
         top = float(np.max(self.s[1]))
         if not (np.isfinite(top) and np.all(self.s[1] - self.s[0] <= _ACCURATE * self.s[1] + 1e-30 * top + 1e-290)):
             raise Inaccurate
@@ -214,24 +228,47 @@ class Trace:
 
     def spread_of(self) -> tuple[Array, Array]:
         """Enclosure of s^2 over each piece."""
-        low = np.minimum(self.s[0][:-1] - self.columns[f"{LOSS} s"] * (1 + 1e-15), self.s[0][1:])
-        high = np.maximum(self.s[1][:-1] + self.columns[f"{GAIN} s"] * (1 + 1e-15), self.s[1][1:])
-        return np.maximum(low, 0.0), high * (1 + 1e-15)
+        return self._lowest(self.s, "s"), self._highest(self.s, "s")
 
     def speed_of(self) -> tuple[Array, Array]:
         """Enclosure of e over each piece."""
-        low = np.minimum(self.e[0][:-1] - self.columns[f"{LOSS} e"] * (1 + 1e-15), self.e[0][1:])
-        high = np.maximum(self.e[1][:-1] + self.columns[f"{GAIN} e"] * (1 + 1e-15), self.e[1][1:])
-        return np.maximum(low, 0.0), high * (1 + 1e-15)
+        return self._lowest(self.e, "e"), self._highest(self.e, "e")
+
+    def third_of(self) -> Array:
+        """Upper bound of v over each piece, of a trace that is ``full``."""
+        return self._highest(self.v, "v")
+
+    def _lowest(self, ends: tuple[Array, Array], name: str) -> Array:
+        """Lower bound of a variance, seen from both ends of each piece; not below 0."""
+        gain, loss = (self.columns[f"{sign} {name}"] * (1 + 1e-15) for sign in (GAIN, LOSS))
+        low = np.maximum(ends[0][:-1] - loss, ends[0][1:] - gain)
+        return np.maximum(low - 1e-15 * np.abs(low), 0.0)
+
+    def _highest(self, ends: tuple[Array, Array], name: str) -> Array:
+        """Upper bound of a variance, seen from both ends of each piece."""
+        gain, loss = (self.columns[f"{sign} {name}"] * (1 + 1e-15) for sign in (GAIN, LOSS))
+        return np.asarray(np.minimum(ends[1][:-1] + gain, ends[1][1:] + loss) * (1 + 1e-15))
 
     def cross_of(self) -> tuple[Array, Array]:
         """Enclosure of c over each piece."""
+        return self._crossed(self.c, "e")
+
+    def second_of(self) -> tuple[Array, Array]:
+        """Enclosure of d over each piece, of a trace that is ``full``."""
+        return self._crossed(self.d, "b")
+
+    def _crossed(self, ends: tuple[Array, Array], name: str) -> tuple[Array, Array]:
         columns = self.columns
-        half = 0.5 * sum(root_up(columns[f"{name} s"]) * root_up(columns[f"{name} e"]) for name in (GAIN, LOSS))
-        low = 0.5 * (self.c[0][:-1] + self.c[0][1:])
-        high = 0.5 * (self.c[1][:-1] + self.c[1][1:])
+        half = 0.5 * sum(root_up(columns[f"{sign} s"]) * root_up(columns[f"{sign} {name}"]) for sign in (GAIN, LOSS))
+        low = 0.5 * (ends[0][:-1] + ends[0][1:])
+        high = 0.5 * (ends[1][:-1] + ends[1][1:])
         slack = half * (1 + 1e-14) + 4e-16 * (np.abs(low) + np.abs(high)) + 1e-300
         return low - slack, high + slack
+
+    @property
+    def chord_error(self) -> Array:
+        """By which the mean and what starts add to it may be away from their chords, (K,)."""
+        return np.asarray(self.columns[f"{MEAN} error"] + self.columns[f"{WIDE} error"])
 
     def rooms(self, bound: float, sign: int) -> tuple[Array, Array]:
         """Lower bounds of bound - sign * (mean and starts and disturbances): at the ends of pieces as lines, (K, 2).
@@ -241,7 +278,7 @@ class Trace:
         low, high = (self.mean if sign > 0 else (-self.mean[1], -self.mean[0]))
         used = high + self.wide
         ends = np.stack([used[:-1], used[1:]], axis=-1)
-        error = self.columns[f"{MEAN} error"] + self.columns[f"{WIDE} error"] + self.pushed[1:]
+        error = self.chord_error + self.pushed[1:]
         room = bound - ends - error[:, None]
         room = room - 1e-15 * (abs(bound) + np.abs(ends) + error[:, None]) - 1e-300 * (error[:, None] > 0)
         return room, bound - low

@@ -9,8 +9,9 @@ and directions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 from flint import arb, arb_mat
@@ -21,15 +22,14 @@ from certbound.gaussian.affine.law import AffineLaw, root_up
 from certbound.gaussian.affine.rough import Decays, joined_parts, lags_of, rough_parts
 from certbound.gaussian.affine.smooth import smooth_parts
 from certbound.gaussian.affine.trace import Trace
+from certbound.gaussian.affine.windows import Chain, crude_parts, window_parts, windows_about
 from certbound.gaussian.scalar import log_tail
 from certbound.watch import poll
 
 _NEAR = 0.01  # of the whole, what enclosures may add
 _ROUNDS, _MOST = 60, 6000  # halvings one after the other, and pieces
-_DRAWN = 400  # pieces of a rough row from a random start, where V falls too: more of them cost more
 _FEW, _VAIN = 8, 6  # pieces that are costly to look at, and halvings after which none of them became known: no more
 _LOOSE = 0.12  # in the exponent of a density, what the variance may move over a piece of a rough row
-_SMALL = 1e-3  # of the whole, shared by all pieces, below which a piece is left as it is
 _UNSURE = 1e-300
 _CERTAIN = 2.5  # logarithm of a number of crossings from which on nothing is said
 _MOST_STATES, _MOST_SIDES, _WATCHED = 80, 8, 12  # for first crossings: states, limits, and limits that marks watch
@@ -60,15 +60,12 @@ class Exit:
     def __post_init__(self) -> None:
         row = [arb(value) for value in self.row]
         self.smooth = all(x.is_zero() for x in (arb_mat([row]) * self.law.noise).entries())
-        if not self.smooth and self.law.covariance is not None:
-            self.law = replace(self.law, kept=tuple(self.row))
         self.trace = Trace(self.law, row, full=not self.smooth)
         self.decays: Decays | None = None
         self.peaks: dict[int, Array] = {}  # of smooth rows: the pieces' costs at their highest rates
+        self.chains: dict[int, Chain] = {}  # of rough rows
         self.parts: list[tuple[float, Array, Integers]] = []  # of every limit: at its start, piece by piece, which
         self._refine()
-        if not self.smooth:
-            self.parts, _ = self._evaluate(closely=True)
 
     def _chosen(self, limit: Limit) -> Integers:
         """Pieces that meet the limit's window."""
@@ -89,16 +86,11 @@ class Exit:
             lines, _ = trace.rooms(limit.bound, limit.sign)
             chosen = self._chosen(limit)
             if self.smooth:
-                first, pieces, about, self.peaks[len(found)] = smooth_parts(trace, lines, chosen)
+                begun, pieces, about, self.peaks[len(found)] = smooth_parts(trace, lines, chosen)
+                first = float(begun[0])
             else:
-                if self.decays is None:
-                    self.decays = Decays(trace, lags_of(trace, self.law.horizon))
-                first, pieces = rough_parts(trace, self.decays, lines, chosen, closely=closely)
-                if closely:
-                    self.peaks[len(found)] = pieces
-                    pieces = joined_parts(trace, self.decays, lines, chosen, pieces)
-                about = np.where(self._loose(lines)[chosen], -np.inf, pieces)
-            found.append((float(first[0]), pieces, chosen))
+                first, pieces, about = self._rough(lines, chosen, len(found), closely=closely)
+            found.append((first, pieces, chosen))
             logs.append((pieces, about, chosen))
         top = max(float(np.max(np.where(np.isfinite(p), p, -np.inf), initial=-np.inf)) for p, _, _ in logs)
         top = max(top, max(part[0] for part in found))
@@ -107,6 +99,33 @@ class Exit:
             gap = np.exp(np.minimum(pieces - top, 700.0)) - np.exp(np.minimum(about - top, 700.0))
             gaps[chosen] += np.where(np.isfinite(pieces) | (pieces == -np.inf), np.maximum(gap, 0.0), np.inf)
         return found, gaps
+
+    def _rough(
+        self, lines: Array, chosen: Integers, number: int, *, closely: bool
+    ) -> tuple[float, Array, Array]:  # fmt: skip
+        """What a limit of a rough row costs at its start, piece by piece, and about that without enclosures."""
+        chain = self.chains[number] = self._chain(lines, chosen, closely=closely)
+        first, pieces = chain.settled()
+        about = np.minimum(pieces, windows_about(self.trace, lines, chosen))
+        about[self._loose(lines)[chosen] | np.isinf(chain.enters)] = -np.inf  # or from any start: shorter ones say more
+        if closely and self.decays is not None:
+            pieces = joined_parts(self.trace, self.decays, lines, chosen, pieces, chain.leaves)
+        return first, pieces, about
+
+    def _chain(self, lines: Array, chosen: Integers, *, closely: bool) -> Chain:
+        """The best comparison of a rough row on each piece, or one of them on all where that is less.
+
+        Only ``closely`` the one is looked at that asks for covariance matrices.
+        """
+        trace = self.trace
+        crude, windows = crude_parts(trace, lines, chosen), window_parts(trace, lines, chosen)
+        chains = [windows.lesser(crude)]
+        if closely:
+            if self.decays is None:
+                self.decays = Decays(trace, lags_of(trace, self.law.horizon))
+            blocks = rough_parts(trace, self.decays, lines, chosen, closely=True)
+            chains += [blocks.lesser(crude), chains[0].lesser(blocks)]
+        return min(chains, key=lambda chain: chain.log_sum)
 
     def _loose(self, lines: Array) -> Array:
         """Pieces over which the level of a rough row moves too much."""
@@ -117,10 +136,38 @@ class Exit:
         return np.asarray(moved > _LOOSE)
 
     def _refine(self) -> None:
+        """Halve pieces where enclosures cost most."""
+        least, kept = np.inf, self.trace
+        for cost in self._rounds():
+            if not self.smooth and cost < least:
+                least, kept = cost, copy(self.trace)
+        if not self.smooth:
+            self._settle(kept)
+
+    def _settle(self, kept: Trace) -> None:
+        """Look closely at a rough row on the last pieces, and on those on which windows cost least.
+
+        A piece is one window at least, and more windows than are needed cost more; blocks of windows that begin
+        nothing anew ask for short pieces.
+        """
+        found = []
+        for trace in (kept, self.trace)[: 1 if len(kept) == len(self.trace) else 2]:
+            self.trace, self.decays, self.chains = trace, None, {}
+            self.parts, _ = self._evaluate(closely=True)
+            found.append((self._largest(), trace, self.decays, self.chains, self.parts))
+        _, self.trace, self.decays, self.chains, self.parts = min(found, key=lambda one: one[0])
+
+    def _largest(self) -> float:
+        """Logarithm of the most that a limit costs."""
+        return max(float(np.logaddexp.reduce(np.append(pieces, first))) for first, pieces, _ in self.parts)
+
+    def _rounds(self) -> Iterator[float]:
+        """Logarithms of what all limits cost after each round of halvings."""
         unknown, rounds = 0, 0  # pieces of which nothing is known, and since when there are no fewer
         for left in range(_ROUNDS - 1, -1, -1):
             poll("pieces of time")
             self.parts, gaps = self._evaluate()
+            yield self._largest()
             rounds = rounds + 1 if _FEW < unknown <= np.sum(np.isinf(gaps)) else 0
             unknown = int(np.sum(np.isinf(gaps)))
             if rounds == _VAIN:
@@ -132,7 +179,7 @@ class Exit:
             whole = np.sum(np.exp(np.where(logs == np.inf, -np.inf, logs) - (top if np.isfinite(top) else 0.0)))
             if not np.any(np.isinf(gaps)) and np.sum(gaps) <= _NEAR * whole:
                 return
-            if len(self.trace) > (_MOST if self.smooth or self.law.covariance is None else _DRAWN):
+            if len(self.trace) > _MOST:
                 return
             worst = np.isinf(gaps)
             least = max(_NEAR * whole / (2 * len(self.trace)), _UNSURE)
@@ -149,8 +196,16 @@ class Exit:
 
     def costs_of(self, number: int) -> Costs:
         """What crossings of a limit cost, piece by piece, each counted at its highest rate."""
-        peaks = self.peaks.get(number, self.parts[number][1])
-        return Costs(times=self.trace.times, logs=peaks, lag=0.0)
+        pieces = self.parts[number][1]
+        return Costs(times=self.trace.times, logs=self.peaks[number], lag=0.0, whole=pieces)
+
+    def within(self, number: int, first: float, last: float) -> float:
+        """Upper bound of P(a limit of a rough row is exceeded on the pieces that [first, last] touches)."""
+        times, chain = self.trace.times, self.chains[number]
+        begun = int(np.clip(np.searchsorted(times, first, side="right") - 1, 0, len(self.trace) - 1))
+        done = int(np.clip(np.searchsorted(times, last, side="left"), begun + 1, len(self.trace)))
+        costs = np.append(chain.settled()[1][begun:done], log_tail(chain.enters[begun]))
+        return float(np.exp(np.minimum(np.logaddexp.reduce(costs), 5.0))) * (1 + 1e-11)
 
     def log_kept(self) -> float | None:
         """Logarithm of a lower bound of P(|a Z| stays within both rooms); None where it is not bounded from both sides.
@@ -184,11 +239,12 @@ class Exit:
         lines = np.minimum(*(trace.rooms(limit.bound, limit.sign)[0] for limit in self.limits))
         if self.smooth:
             first, pieces, _, _ = smooth_parts(trace, lines, every)
+            enters = np.where(lines[:, 0] >= 0, lines[:, 0] / root_up(trace.spread_of()[1]), -np.inf)
+            heads = np.exp(log_tail(enters))
+            heads[0] = np.exp(min(float(first[0]), 0.0))
         else:
-            assert self.decays is not None
-            first, pieces = rough_parts(trace, self.decays, lines, every, closely=closely)
-        heads = np.exp(log_tail(np.where(lines[:, 0] >= 0, lines[:, 0] / root_up(trace.spread_of()[1]), -np.inf)))
-        heads[0] = np.exp(min(float(first[0]), 0.0))
+            chain = self._chain(lines, every, closely=closely)
+            pieces, heads = chain.settled()[1], np.exp(log_tail(chain.enters))
         return 2 * np.exp(np.minimum(pieces, 5.0)) * (1 + 1e-11), 2 * heads * (1 + 1e-11)
 
     def _product(self, costs: Array, heads: Array) -> float:
@@ -326,6 +382,8 @@ class Side:
             head = float(np.exp(log_tail(self.level / root_up(high) * (1 - 1e-12))))
         if self.after is None and first == 0 and last == self.exit.law.horizon:
             return float(np.exp(self.exit.log_of(self.number)))
+        if not self.exit.smooth:
+            return self.exit.within(self.number, first, last)
         plain = self.exit.costs_of(self.number)
         middle = last
         after = 0.0

@@ -36,6 +36,17 @@ CASES: dict[str, Callable[[], cb.Problem]] = {
     "an undriven state": lambda: linear_problem(
         [[-1, 0], [0, -0.5]], [[0.3], [0.0]], [1.2, 1.0], horizon=5.0, initial=[0.0, 0.5]
     ),
+    "a drawn filter": lambda: linear_problem(
+        [[-1, 1], [0, -0.5]], [[0.1, 0.0], [0.0, 0.5]], [1.5, OPEN], horizon=5.0,
+        initial=cb.GaussianStart([0.0, 0.0], [[0.0, 0.0], [0.0, 0.25]]),
+    ),
+    "a drawn constant": lambda: linear_problem(
+        [[-1, 1], [0, 0]], [[0.1], [0.0]], [1.5, OPEN], horizon=5.0,
+        initial=cb.GaussianStart([0.0, 0.0], [[0.0, 0.0], [0.0, 0.25]]),
+    ),
+    "drawn and soon still": lambda: linear_problem(
+        [[-1]], [[0.2]], [1.5], horizon=5.0, initial=cb.GaussianStart([0.0], [[0.125]])
+    ),
     "disturbances": lambda: oscillator(gain=[[0.0], [0.05]], bounds=[1.8, OPEN]),
 }
 
@@ -48,6 +59,7 @@ def test_what_is_proved_is_near_the_provers_bound_and_above_its_lower_one(name: 
     found = proved(problem)
     clumps = 1.3 if name == "a stiff row" else 1.0  # of crossings, which the prover alone tells apart
     assert found <= 1.3 * clumps * 10**answer.log10_delta
+    assert 10**answer.log10_delta <= 1.02 * found  # the prover adopts what certificates state
     below = affine_failing(problem)
     if below is not None:
         assert found >= below.probability

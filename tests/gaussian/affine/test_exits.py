@@ -62,6 +62,12 @@ def test_a_stationary_ou_process_agrees_with_its_differential_equation():
     assert -2.592 < one_sided(law, [1.0], 4.0) < -2.592 + np.log10(1.2)
 
 
+def test_a_stationary_start_is_bounded_from_both_sides():
+    # X of variance 1/8 all the time: the variance never grows, and events at single times were put no step apart
+    low, high = both(law_of([[-1.0]], [0.5], 5.0, covariance=[[0.125]]), [[1.0]], [1.5])
+    assert 3e-4 < low < 1.8e-3 < high < 2.4e-3  # 1.78e-3 of 40 000 simulated paths leave at 2000 samples
+
+
 def test_a_smooth_stationary_row_agrees_with_rices_formula():
     # position of a damped oscillator, variance 1, mean period 2 pi
     slope, noise = [[0, 1], [-1, -0.4]], [0, np.sqrt(0.8)]
@@ -168,7 +174,15 @@ def test_a_resting_row_that_a_drawn_state_drives_is_bounded_in_few_pieces():
         kicks = np.sqrt(step) * rng.normal(size=(2, paths))
         v, w = v + step * (w - v) + 0.1 * kicks[0], w - step * 0.5 * w + 0.5 * kicks[1]
         beyond |= v > 1.5
-    assert beyond.mean() - 4 * np.sqrt(beyond.mean() / paths) < np.exp(found.log_of(0)) < 1
+    high = np.exp(found.log_of(0))
+    assert beyond.mean() - 4 * np.sqrt(beyond.mean() / paths) < high < 4 * beyond.mean()  # it was 75 times as much
+
+
+def test_a_level_that_falls_is_followed_as_a_line():
+    """A row with noise of its own whose mean moves: levels that stand still over pieces said twice as much."""
+    slope, noise = [[-1.0, 0.0], [1.0, -1.0]], [[0.2, 0.0], [0.0, 0.1]]
+    law = law_of(slope, noise, 5.0, mean=[1.0, 0.2], covariance=np.diag([0.02, 0.01]))
+    assert 10 ** one_sided(law, [0.0, 1.0], 1.0) < 2.5e-6  # 3.1e-6 by blocks alone
 
 
 def test_marked_crossings_are_counted_as_often_as_paths_make_them():
