@@ -261,7 +261,7 @@ def test_a_forged_level_is_not_proved_and_without_a_row_nothing_is(
         forged["proof"]["level"] = change(float.fromhex(forged["proof"]["level"])).hex()
         assert not check_data(forged).valid
     monkeypatch.delitem(claims.ENGINES, "boxes")
-    with pytest.raises(CertificateError, match=r"`proof\.engine` must be one of linear, constants, barrier"):
+    with pytest.raises(CertificateError, match=r"`proof\.engine` must be one of linear, affine, constants, barrier"):
         check_data(parse(text))
 
 
