@@ -18,8 +18,8 @@ from flint import arb_mat
 
 from certbound.arrays import Array, Integers, Mask
 from certbound.gaussian.affine.law import GAIN, floats, root_up
-from certbound.gaussian.affine.trace import Trace, dot, rows_of
 from certbound.gaussian.affine.row_windows import Chain, own_noise
+from certbound.gaussian.affine.trace import Trace, dot, rows_of
 from certbound.gaussian.scalar import (
     Clock,
     clock_crossing,

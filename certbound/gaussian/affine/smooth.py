@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from certbound.arrays import Array, Integers
-from certbound.gaussian.affine.trace import Trace
 from certbound.gaussian.affine.row_windows import crude_parts
+from certbound.gaussian.affine.trace import Trace
 from certbound.gaussian.scalar import log_crossings
 from certbound.rigor.rounding import quiet
 

@@ -16,9 +16,9 @@ from flint import arb_mat
 from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.doubling import Doubling
 from certbound.gaussian.affine.law import GAIN, LOSS, MEAN, WIDE, AffineLaw, transposed_square
+from certbound.gaussian.affine.row_windows import CLOCKS, LONGEST, MOST_WINDOWS, SHARES
 from certbound.gaussian.affine.trace import Inaccurate
 from certbound.gaussian.affine.upper import Limit
-from certbound.gaussian.affine.row_windows import CLOCKS, LONGEST, MOST_WINDOWS, SHARES
 from certbound.gaussian.scalar import log_line_crossing, log_tail
 from certbound.rigor.rounding import quiet
 from certbound.watch import poll

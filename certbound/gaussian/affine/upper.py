@@ -20,9 +20,9 @@ from certbound.arrays import Array, Integers
 from certbound.gaussian.affine.lagged import Costs, Spans, Watched, choose_marks, lagged_cost
 from certbound.gaussian.affine.law import AffineLaw, root_up
 from certbound.gaussian.affine.rough import Decays, joined_parts, lags_of, rough_parts
+from certbound.gaussian.affine.row_windows import Chain, crude_parts, window_parts, windows_about
 from certbound.gaussian.affine.smooth import smooth_parts
 from certbound.gaussian.affine.trace import Trace
-from certbound.gaussian.affine.row_windows import Chain, crude_parts, window_parts, windows_about
 from certbound.gaussian.scalar import log_tail
 from certbound.watch import poll
 
