@@ -20,6 +20,7 @@ from certbound.reach.nominal import Flow
 from certbound.safety.falsification import follow, rooms
 
 _FEWEST, _MOST = 2, 20
+_WHOLE = 3  # states from which on sets of starts are looked at as a whole
 _ROOM = 1.1
 _PIECES = 48
 _SAMPLES = 64
@@ -32,8 +33,8 @@ _FITTED = 0.6  # of a remainder is left once the slopes are fitted
 def linear_chance(problem: Problem) -> float:
     """How far the constraints are away, in units of what the linear response needs at the problem's delta.
 
-    Infinite where nothing speaks against it: a linear model, discrete time, one state (where others are near the truth
-    at once), targets.
+    Infinite where nothing speaks against it, though a look at one path says little for it either: a linear model,
+    discrete time, one state, targets, and two states, whose sets of starts can be halved.
     """
     system, n = problem.system, problem.system.dimension
     if not isinstance(system, ContinuousSystem) or not _FEWEST <= n <= _MOST or problem.reach is not None:
@@ -44,7 +45,8 @@ def linear_chance(problem: Problem) -> float:
         return math.inf
     with np.errstate(all="ignore"):
         far, needed = _Sketch.of(problem, flow).levels()
-    return far / (_ROOM * needed)
+    chance = far / (_ROOM * needed)
+    return math.inf if chance >= 1 and n < _WHOLE else chance
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
