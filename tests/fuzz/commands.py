@@ -55,6 +55,9 @@ _SAID = {
 }
 """Words of a plain ValueError that its docstring announces."""
 
+_TOO_COARSE = "steps are too coarse for the fastest modes of this model"
+"""Of the warning of `simulate_exits` where too few steps are asked for."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -339,6 +342,9 @@ class Run:
         spent = time.process_time() - started
         self.seconds[command] = self.seconds.get(command, 0.0) + spent
         for warning in heard:
+            if _TOO_COARSE in str(warning.message):  # what a user who asks for too few steps is to be told
+                self.facts["too coarse"] = True
+                continue
             place = f"{Path(warning.filename).name}:{warning.lineno}"
             self.report(command, "warning", f"{warning.category.__name__} {place}", str(warning.message))
         if spent > BUDGETS[command]:
