@@ -24,6 +24,7 @@ _DIRECTIONS = 8  # that are cut into cells
 _SKETCH = 300  # cells, from which the size of the probability is seen
 _NODES = 400  # at which what matters is looked for
 _MISSED = 1e-4  # of the probability: what the directions that are not cut may lie beyond their reach
+_FARTHEST = 1e100  # standard deviations: squares of larger numbers overflow
 
 
 def unserved(problem: Problem) -> str | None:
@@ -116,6 +117,7 @@ def effects(problem: Problem, engine: Linearisation) -> Array:
         first, last = (0.0, np.inf) if constraint.during is None else constraint.during
         apart = np.maximum(np.maximum(first - times, times - last), 0.0)  # a window may lie between two times
         far = np.where((apart == apart.min())[:, None], np.abs(room) / deviation, np.inf)
+        far = np.minimum(far, _FARTHEST)
         unit = deviation[..., None] if isinstance(region.form, Faces) else 1.0  # of a round set: its own size
         found.append(np.einsum("ji,kil->kjl", rows, maps[:, places]) / unit)
         sizes.append(far)
