@@ -31,7 +31,7 @@ class Affine:
         A, (n, n).
     drift : arb_mat
         A m + c with the disturbances in the middle of their set, (n, 1): the mean's slope at time 0.
-    pushes : tuple of arb_mat
+    disturbances : tuple of arb_mat
         E_j times the radius of the j-th disturbance, each (n, 1), of those that move a state.
     diffusion, noise : arb_mat
         G, (n, m), and G G^T, (n, n).
@@ -43,7 +43,7 @@ class Affine:
 
     slope: arb_mat
     drift: arb_mat
-    pushes: tuple[arb_mat, ...]
+    disturbances: tuple[arb_mat, ...]
     diffusion: arb_mat
     noise: arb_mat
     middle: arb_mat
@@ -77,7 +77,7 @@ def affine_of(model: Model, budget: Budget) -> Affine:
     radius = [arb.max(b - m, m - a).upper() for a, b, m in zip(initial.low, initial.high, middle)]
     centre = [((arb(a) + arb(b)) / 2).mid() for a, b in model.disturbance]
     reach = [arb.max(arb(b) - m, m - arb(a)).upper() for (a, b), m in zip(model.disturbance, centre)]
-    pushes = [[gains[i, j] * value for i in range(n)] for j, value in enumerate(reach)]
+    disturbances = [[gains[i, j] * value for i in range(n)] for j, value in enumerate(reach)]
     budget.products(n, n, 8)
     origin = column(_values(model, [arb(0)] * n, centre, budget))
     covariance = initial.covariance
@@ -85,7 +85,7 @@ def affine_of(model: Model, budget: Budget) -> Affine:
         slope=slope, drift=slope * column(middle) + origin, diffusion=model.noise.constant(),
         noise=model.noise.covariance(), middle=column(middle),
         radius=column(radius if covariance is None else [arb(0)] * n),
-        pushes=tuple(column(push) for push in pushes if not all(x.is_zero() for x in push)),
+        disturbances=tuple(column(one) for one in disturbances if not all(x.is_zero() for x in one)),
         covariance=None if covariance is None else _as_stated(covariance),
     )  # fmt: skip
 

@@ -132,7 +132,7 @@ class _Law:
     ) -> None:  # fmt: skip
         self.affine, self.grids, self.budget = affine, grids, budget
         n = affine.slope.nrows()
-        budget.products(n, n, n * (6 + len(affine.pushes)))
+        budget.products(n, n, n * (6 + len(affine.disturbances)))
         sources = sources_of(affine, gain, loss)
         drift = None if all(x.is_zero() for x in affine.drift.entries()) else affine.drift
         finest = max(leaf.level for leaves in grids for leaf in leaves)

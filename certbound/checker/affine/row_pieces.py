@@ -26,7 +26,7 @@ from certbound.checker.affine.gramians import Transitions
 from certbound.checker.balls import diagonal, upper
 from certbound.checker.report import Budget
 
-GAIN, LOSS, MEAN, WIDE, PUSH = "gain", "loss", "mean", "wide", "push"
+GAIN, LOSS, MEAN, WIDE, DISTURBANCE = "gain", "loss", "mean", "wide", "disturbance"
 
 _PIECE = 24
 """Memory of a piece that is kept, in balls: eleven of them, and two times as fractions."""
@@ -102,8 +102,8 @@ def sources_of(affine: Affine, gain: arb_mat, loss: arb_mat | None) -> dict[str,
     if any(not x.is_zero() for x in affine.radius.entries()):
         wide = slope * slope * diagonal(affine.radius.entries())
         found[WIDE] = wide * wide.transpose()
-    for j, push in enumerate(affine.pushes):
-        found[f"{PUSH}{j}"] = push * push.transpose()
+    for j, disturbance in enumerate(affine.disturbances):
+        found[f"{DISTURBANCE}{j}"] = disturbance * disturbance.transpose()
     return {name: matrix for name, matrix in found.items() if any(not x.is_zero() for x in matrix.entries())}
 
 
@@ -185,17 +185,17 @@ class Follower:
     def _errors(self, rows: arb_mat, level: int) -> list[tuple[arb, arb, arb]]:
         """Over pieces of one level: the mean's step, how far it is from its chord, and what disturbances add."""
         gramians, h = self.transitions.gramians, self.transitions.step(level)
-        errors, pushed = [_ZERO] * rows.nrows(), [_ZERO] * rows.nrows()
+        errors, disturbed = [_ZERO] * rows.nrows(), [_ZERO] * rows.nrows()
         starts = len([x for x in self.affine.radius.entries() if not x.is_zero()])
         for name, found in gramians.items():
             if name in (MEAN, WIDE):
                 factor = (h * h * h * (starts if name == WIDE else 1) / 48).sqrt()
                 errors = [e + factor * _root(square) for e, square in zip(errors, _squares(rows, found[level]))]
-            elif name.startswith(PUSH):
-                pushed = [e + h.sqrt() * _root(square) for e, square in zip(pushed, _squares(rows, found[level]))]
+            elif name.startswith(DISTURBANCE):
+                disturbed = [e + h.sqrt() * _root(square) for e, square in zip(disturbed, _squares(rows, found[level]))]
         drifts = self.transitions.drifts
         steps = (rows * drifts[level]).entries() if drifts else [_ZERO] * rows.nrows()
-        return list(zip(steps, errors, pushed))
+        return list(zip(steps, errors, disturbed))
 
     def _variances(
         self, row: Row, changes: Sequence[tuple[_Moments, _Moments]], smooth: bool
@@ -213,12 +213,12 @@ class Follower:
     def _means(self, rows: Sequence[Row], found: Sequence[Sequence[arb]]) -> list[Means]:
         """Bounds of the mean along the row over every piece."""
         middle, radius = self.affine.middle.entries(), self.affine.radius.entries()
-        at, pushed = _dot(rows[0], middle), _ZERO
+        at, disturbed = _dot(rows[0], middle), _ZERO
         spread = [sum((abs(x) * y for x, y in zip(row, radius) if not y.is_zero()), _ZERO) for row in rows]
         result = []
-        for k, (step, error, push) in enumerate(found):
-            pushed = pushed + push
-            more = upper(error + pushed)
+        for k, (step, error, disturbance) in enumerate(found):
+            disturbed = disturbed + disturbance
+            more = upper(error + disturbed)
             ends = ((at, spread[k] + more), (at + step, spread[k + 1] + more))
             result.append(Means(*(-upper(w - u) for u, w in ends), *(upper(u + w) for u, w in ends)))
             at = at + step

@@ -50,7 +50,6 @@ class Chain:
         costs, enters, leaves = (np.where(own, first, second) for first, second in pairs)
         return Chain(costs=costs, enters=enters, leaves=leaves)
 
-
     @quiet
     def settled(self) -> tuple[float, Array]:
         """Logarithms of what being beyond the first level at the start costs, and of each piece with what lies between

@@ -24,7 +24,7 @@ from certbound.rigor.rounding import quiet
 from certbound.watch import poll
 
 _DEEPEST, _MOST, _ROUNDS = 60, 30_000, 80  # halvings of the horizon, pieces of a grid, and rounds of halving
-_VAIN = 5  # rounds one after the other that gained nothing: no more
+_STALLED = 5  # rounds one after the other that gained nothing: no more
 _RAISED = 2.0**-32  # of the size of what a random start's variance changes by: what both of its parts are raised by
 _LEAST = 1e-300
 _ACCURATE = 1e-9  # of a matrix's largest entry, by which its balls may be wide
@@ -175,13 +175,13 @@ class _Direction:
 
         Windows of a row with noise of its own ask for pieces that are not too short.
         """
-        best, found, vain = np.inf, (self.levels, self.bounds), 0
+        best, found, stalled = np.inf, (self.levels, self.bounds), 0
         for _ in range(_ROUNDS):
             poll("pieces of time for the certificate")
             self._follow()
             self.bounds = [self._bound(limit) for limit in self.limits]
             total = sum(float(np.sum(bound.costs)) + bound.rest for bound in self.bounds)
-            vain = 0 if total < best * (1 - near / 10) else vain + 1
+            stalled = 0 if total < best * (1 - near / 10) else stalled + 1
             if total <= best:
                 best, found = total, (self.levels, self.bounds)
             gaps = np.zeros(len(self.levels))
@@ -189,7 +189,7 @@ class _Direction:
                 whole = max(float(np.sum(bound.costs)) + bound.rest, _LEAST)
                 gaps[bound.chosen] += np.minimum(bound.gaps / whole, 1.0)
             open_ = (gaps > near / (2 * len(gaps))) & (gaps > 0.02 * gaps.max()) & (self.levels < _DEEPEST)
-            if np.sum(gaps) <= near or not np.any(open_) or len(gaps) > _MOST or (vain > _VAIN and best < 1):
+            if np.sum(gaps) <= near or not np.any(open_) or len(gaps) > _MOST or (stalled > _STALLED and best < 1):
                 break
             self.levels = np.repeat(self.levels + open_, np.where(open_, 2, 1))
         self.levels, self.bounds = found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from flint import ctx
 
@@ -13,8 +14,10 @@ from certbound.gaussian.affine import Inaccurate, Stated, bound_exits, bound_exi
 from certbound.problem.problem import Problem
 from certbound.reach.affine.reading import AffineModel, affine_model
 
+T = TypeVar("T")
+
 _BITS = (192, 512, 1400, 4000)
-_SPARE = 64  # bits of the checker's balls beyond those with which pieces were found
+_GUARD = 64  # bits of the checker's balls beyond those with which pieces were found
 _FEW, _PART = 8, -4.0  # limits that a lower bound counts, and the least logarithm of their part of the likeliest one
 _LEAST = -1e12  # log10 of a probability that is not told apart from 0
 
@@ -59,14 +62,8 @@ def affine_answer(
         first(answer(total, logs))
         return True
 
-    for bits in _BITS:
-        with ctx.workprec(bits):
-            try:
-                found = bound_exits(model.law(), model.rows, model.limits, go_on)
-            except Inaccurate:
-                continue
-        return answer(found.log_probability, found.logs)
-    return None
+    found = _accurate(lambda: bound_exits(model.law(), model.rows, model.limits, go_on))
+    return None if found is None else answer(found[0].log_probability, found[0].logs)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,14 +85,8 @@ def affine_pieces(problem: Problem, near: float) -> AffinePieces | None:
     model = affine_model(problem)
     if model is None:
         return None
-    for bits in _BITS:
-        with ctx.workprec(bits):
-            try:
-                stated = stated_exits(model.law(), model.rows, model.limits, near)
-            except Inaccurate:
-                continue
-        return AffinePieces(model=model, stated=stated, bits=bits + _SPARE)
-    return None
+    found = _accurate(lambda: stated_exits(model.law(), model.rows, model.limits, near))
+    return None if found is None else AffinePieces(model=model, stated=found[0], bits=found[1] + _GUARD)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,19 +108,29 @@ def affine_failing(problem: Problem) -> AffineFailing | None:
     model = affine_model(problem)
     if model is None or any(limit.during is not None for limit in model.limits):
         return None
+
+    def failing() -> AffineFailing:
+        law = model.law()
+        logs = bound_exits(law, model.rows, model.limits, lambda total, logs: False).logs
+        order = sorted(range(len(logs)), key=lambda place: -logs[place])
+        likely = [place for place in order[:_FEW] if logs[place] > logs[order[0]] + _PART]
+        asked = [(model.limits[k].direction, model.limits[k].sign, model.limits[k].bound) for k in likely]
+        start = tuple(float(law.mean[i, 0].mid()) for i in range(problem.system.dimension))
+        found = bound_exits_below(law, model.rows, asked)
+        return AffineFailing(probability=found, start=start, label=model.names[order[0]])
+
+    found = _accurate(failing)
+    return found[0] if found is not None and found[0].probability > 0 else None
+
+
+def _accurate(work: Callable[[], T]) -> tuple[T, int] | None:
+    """What is found with as few bits as keep every variance accurate, and these bits; None where none of them do."""
     for bits in _BITS:
         with ctx.workprec(bits):
             try:
-                law = model.law()
-                logs = bound_exits(law, model.rows, model.limits, lambda total, logs: False).logs
-                order = sorted(range(len(logs)), key=lambda place: -logs[place])
-                likely = [place for place in order[:_FEW] if logs[place] > logs[order[0]] + _PART]
-                asked = [(model.limits[k].direction, model.limits[k].sign, model.limits[k].bound) for k in likely]
-                start = tuple(float(law.mean[i, 0].mid()) for i in range(problem.system.dimension))
-                found = bound_exits_below(law, model.rows, asked)
+                return work(), bits
             except Inaccurate:
                 continue
-        return AffineFailing(probability=found, start=start, label=model.names[order[0]]) if found > 0 else None
     return None
 
 

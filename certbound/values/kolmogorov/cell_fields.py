@@ -38,7 +38,7 @@ _FINEST = 32
 _MANY, _TOGETHER = 2**24, 2**21
 """Bernstein coefficients of all of them at most, two seconds' work, and of those that are looked at together, 16 MB."""
 
-_ROUNDED = 1e-14  # of sums of up to 6 products, three in a row for each axis
+_ROUNDED = 1e-13  # of sums of up to 6 products, three in a row for each axis, and of powers of shares and of their rest
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -19,7 +19,6 @@ _RUNG = {2: 1.2, 3: 1.05}
 takes as long as a dozen steps: with 1.07 a third of the time of ten seconds was spent on that."""
 
 
-
 def growing_steps(layer: float, longest: Size, states: int) -> Size:
     """Lengths of steps that grow from the layer at the end on, to ``longest``."""
     return partial(_least, longest, 0.0, partial(_growing, layer / _FIRST, _GROWTH[states]))

@@ -238,7 +238,8 @@ def rough_residual(
     lines = _lines(generator, values, rates, factors, worst, proved=False)
     bulge, middle = _bulges(values, rates, h)
     more = _most_of_bulge(generator, bulge, middle, factors, proved=False)
-    return lines, np.maximum(more, 0.0)
+    at_knots = np.maximum(lines, 0.0)
+    return at_knots, np.maximum(lines + np.maximum(more, 0.0), 0.0) - at_knots
 
 
 _LATE, _EARLY, _EVERY = slice(None, -1), slice(1, None), slice(None)
