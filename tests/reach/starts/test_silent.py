@@ -138,3 +138,12 @@ def test_paths_that_overflow_are_refused_in_words(rate: float) -> None:
         return
     with pytest.raises((ArithmeticError, EngineError), match="beyond"):
         bounded(problem.replace(horizon=4.0))
+
+
+def test_a_limit_that_no_start_comes_near_counts_for_nothing_without_a_warning() -> None:
+    """It lies 1e160 standard deviations away, the square of which is no float."""
+    start = cb.GaussianStart([0.0, 0.0], np.diag([1.0, 1e-8]))
+    limits = [cb.Inside(cb.HalfSpace([1.0, 0.0], 2.0)), cb.Inside(cb.HalfSpace([0.0, 1.0], 1e156))]
+    problem = cb.Problem(model([[0.0, 0.0], [0.0, 0.0]]), initial=start, safe=limits, horizon=1.0)
+    with np.errstate(over="raise"):
+        holds(bounded(problem), float(norm.sf(2.0)), 1.05)
